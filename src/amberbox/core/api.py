@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Final, Literal, TypeAlias
 
+from amberbox.core.command import FINAL, Risk
 from amberbox.core.robot_status import RobotStatus, Severity
 from amberbox.core.types import Later, Missing
 from amberbox.core.units import LIKELY
@@ -28,6 +29,7 @@ GapKind: TypeAlias = Literal[
 FetchState: TypeAlias = Literal["waiting", "asked", "copying", "ready", "gone", "cancelled"]
 DownloadState: TypeAlias = Literal["queued", "running", "done", "failed", "cancelled", "expired"]
 DownloadFormat: TypeAlias = Literal["csv", "parquet", "mcap", "journals"]
+ModelState: TypeAlias = Literal["queued", "running", "done", "failed", "cancelled"]
 AlarmKind: TypeAlias = Literal["robot", "offline"]
 AlarmState: TypeAlias = Literal["open", "acknowledged", "shelved", "resolved"]
 CauseKind: TypeAlias = Literal["fault", "false_alarm", "other"]
@@ -402,13 +404,21 @@ class Note(_Answer):
 
 @dataclass(frozen=True, slots=True)
 class MomentNote(_Answer):
-    """A remark on a moment; ``mission`` is empty where it is on no mission."""
+    """A note on a moment, or until ``to``; ``mission`` is empty where it is on no mission.
+
+    ``note`` is the id that the robot's record has as well, ``about`` an item, a variable or a
+    component.
+    """
 
     id: int
     at: str
     who: str
     text: str
     mission: Later[str]
+    note: Later[str]
+    to: Later[str | None]
+    about: Later[str]
+    revision: Later[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,7 +439,11 @@ class Mission(_Answer):
 
 @dataclass(frozen=True, slots=True)
 class Incident(_Answer):
-    """A window that is kept; ``state`` is ``open``, ``complete`` or ``released``."""
+    """A window that is kept; ``state`` is ``open``, ``complete`` or ``released``.
+
+    ``on_robot`` is what the robot does with one that was marked on the server: ``asked``,
+    ``pinned``, ``released``, or why it does not; empty where it takes no commands.
+    """
 
     id: str
     origin: Origin
@@ -439,6 +453,7 @@ class Incident(_Answer):
     trigger: Later[str]
     from_: str
     to: str
+    on_robot: Later[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -533,6 +548,80 @@ class Download(_Answer):
     def is_over(self) -> bool:
         """Return whether the download is no longer queued or running."""
         return self.state not in ("queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelLine(_Answer):
+    """A file of a robot's ``models/``; ``kind`` is empty where it is no model.
+
+    ``problems`` are its errors: with one it answers nothing.
+    """
+
+    name: str
+    kind: Literal["components", "equations", ""]
+    problems: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class LearntModel(_Answer):
+    """A model of detectors that the server learns, or has learnt; each ``version`` of a name once.
+
+    Of a ``team`` the robots are learnt side by side.
+
+    ``progress`` goes from 0 to 1; ``file``, ``sha256`` and ``report`` are there when the state is
+    ``done``. ``report`` says what can be promised, a sentence each, and what was left out.
+    """
+
+    id: str
+    name: str
+    version: int
+    owner: str
+    state: ModelState
+    progress: float
+    robots: Later[Sequence[str]]
+    missions: Later[Sequence[str]]
+    from_: Later[str | None]
+    to: Later[str | None]
+    detectors: Later[Sequence[str]]
+    team: Later[bool]
+    false_alarms_per_hour: Later[float]
+    file: Later[str | None]
+    bytes: Later[int]
+    sha256: Later[str]
+    report: Later[Sequence[str]]
+    error: Later[str]
+    asked: Later[str]
+    started: Later[str | None]
+    ended: Later[str | None]
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the model is no longer queued or being learnt."""
+        return self.state not in ("queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorAlarmLine(_Answer):
+    """An alarm that a model of detectors raises on what a robot recorded.
+
+    ``robot`` is empty for one of a team; ``gone`` is null if it lasts to the end of the range.
+    ``contributions`` are shares of variables or events.
+    """
+
+    robot: str
+    id: str
+    detector: str
+    series: str
+    onset: str
+    confirmed: str
+    gone: str | None
+    score: float
+    threshold: float
+    p_value: float
+    baseline: str
+    reason: str
+    contributions: Mapping[str, float]
+    transitions: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -703,3 +792,306 @@ class AuditRow(_Answer):
     result: str
     details: Later[Mapping[str, Any]]
     hash: Later[str]
+
+
+CommandState: TypeAlias = Literal[
+    "unsigned", "withdrawn", "waiting", "sent", "accepted", "refused", "done", "failed", "aborted",
+    "outcome_unknown", "expired",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerLine(_Answer):
+    """What a robot says of a command; ``at`` by its own clock, ``result`` is JSON text."""
+
+    state: str
+    reason: str
+    result: str
+    at: str
+    received: str
+
+
+@dataclass(frozen=True, slots=True)
+class CommandLine(_Answer):
+    """A command to a robot, and what became of it.
+
+    ``parameters`` is the JSON text of an object, as it is signed. ``key_id`` is that of the key
+    that signed it. ``state``: ``unsigned`` and ``withdrawn`` are states on the server, ``waiting``
+    is one that was not sent yet, ``sent`` one without an answer; all others are what the robot
+    answered, or ``expired``. ``number`` is for ``after``.
+    """
+
+    number: int
+    id: str
+    robot: str
+    action: str
+    parameters: str
+    risk: Risk
+    issuer: str
+    run: str
+    step: str
+    key_id: str
+    state: CommandState
+    reason: str
+    created: str
+    expires: str
+    sent: Later[str | None]
+    answered: Later[str | None]
+    answers: Later[Sequence[AnswerLine]]
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether nothing more comes."""
+        return self.state == "withdrawn" or self.state in FINAL
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLease(_Answer):
+    """Who holds a robot; free without a ``holder``. ``number`` is what commands are signed for."""
+
+    number: int
+    holder: str
+    run: str
+
+
+@dataclass(frozen=True, slots=True)
+class ActionParameter(_Answer):
+    """A parameter of an action; without a ``default`` it is required."""
+
+    name: str
+    type: str
+    unit: str
+    min: Later[float | None]
+    max: Later[float | None]
+    choices: Later[Sequence[Value]]
+    default: Annotated[Value, Missing(None)]
+    description: str
+    max_length: Later[int | None]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotAction(_Answer):
+    """An action that a robot has announced; ``recovers`` are failure modes it is a remedy of."""
+
+    name: str
+    risk: Risk
+    description: str
+    timeout_s: float
+    simulated: bool
+    parameters: Later[Sequence[ActionParameter]]
+    recovers: Later[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotCommands(_Answer):
+    """How commands reach a robot now, and what it can do.
+
+    ``takes_commands``: it is connected and has minted a challenge. ``server_id`` is what its trust
+    file names. ``waiting`` is the id of the motion that waits for its confirmation at the robot,
+    ``by_code`` whether a code is shown there for it, ``tries`` how many wrong ones were entered.
+    ``challenge`` (hexadecimal, newest) is only for who may command. ``announced`` is when it sent
+    its actions, ``left_out`` how many of them are not shown here.
+    """
+
+    robot: str
+    online: bool
+    takes_commands: bool
+    server_id: str
+    lease: RobotLease
+    waiting: str
+    by_code: bool
+    tries: int
+    challenge: str
+    actions: Later[Sequence[RobotAction]]
+    announced: Later[str | None]
+    left_out: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class AbortReport(_Answer):
+    """What an abort has reached: whether the robot got it, and commands that are not sent now."""
+
+    delivered: bool
+    withdrawn: Later[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RevokedKeyLine(_Answer):
+    """A person's key that signs nothing any more."""
+
+    key_id: str
+    who: str
+    reason: str
+    at: str
+
+
+RunState: TypeAlias = Literal[
+    "planned", "running", "paused", "stopping", "judging", "passed", "failed", "undecided",
+    "aborted", "error",
+]  # fmt: skip
+RunRole: TypeAlias = Literal["technician", "operator"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentLine(_Answer):
+    """An experiment that can be run on a robot; one with ``problems`` cannot.
+
+    ``robot`` is that whose folder has it, empty for an uploaded one, of which ``who`` and ``added``
+    tell. ``roles`` are those of the people who take part, ``about`` the failure modes that its
+    verdict speaks of, ``sha256`` is over all its files.
+    """
+
+    name: str
+    title: str
+    description: str
+    safety: str
+    duration_s: float | None
+    robot: str
+    sha256: str
+    roles: Later[Sequence[RunRole]]
+    parameters: Later[Sequence[ActionParameter]]
+    about: Later[Sequence[str]]
+    problems: Later[Sequence[str]]
+    who: str = ""
+    added: Later[str | None] = None
+
+
+@dataclass(frozen=True, slots=True)
+class UnitTestLine(_Answer):
+    """A unit test that a robot has announced; ``about`` are failure modes that it speaks of."""
+
+    name: str
+    description: str
+    risk: Risk
+    timeout_s: float
+    about: Later[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RunLine(_Answer):
+    """A run of an experiment, or of a unit test.
+
+    ``planned`` is one that has not begun, ``stopping`` one that is over while the robot still
+    stops, ``judging`` one whose record has not come yet, ``undecided`` one whose record does not
+    tell.
+    ``series`` is the id of the first of runs that repeat each other, of which ``left`` follow.
+    ``test`` is the test of the ``diagnosis`` that its verdict answers, ``version`` that of the
+    robot's own software. ``number`` is for ``after``. A run ``at_robot`` was carried out there
+    alone, and came with its record.
+    """
+
+    number: int
+    id: str
+    robot: str
+    kind: Literal["experiment", "unit_test"]
+    name: str
+    title: str
+    sha256: str
+    state: RunState
+    reason: str
+    who: str
+    series: str
+    left: int
+    diagnosis: str
+    test: str
+    version: str
+    created: str
+    begun: Later[str | None]
+    ended: Later[str | None]
+    at_robot: Later[bool] = False
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether nothing more comes."""
+        return self.state in ("passed", "failed", "undecided", "aborted", "error")
+
+
+@dataclass(frozen=True, slots=True)
+class FormField(_Answer):
+    """A field of a step; ``kind``: ``pass_fail``, ``confirm``, ``number``, ``choice``, ``text``."""
+
+    name: str
+    kind: str
+    label: str
+    unit: str
+    min: Later[float | None]
+    max: Later[float | None]
+    choices: Later[Sequence[str]]
+    required: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PersonStep(_Answer):
+    """A step that waits for a person of a role, or of a higher one; ``mine``: the caller may."""
+
+    task: str
+    element: str
+    name: str
+    role: str
+    lane: str
+    text: str
+    expected: str
+    deviation: str
+    picture: str
+    since: str
+    mine: bool
+    fields: Later[Sequence[FormField]]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStep(_Answer):
+    """A step that the robot carries out, or is to: ``waits`` is what it waits for.
+
+    ``command`` is empty before it was given; its state is that of ``CommandLine``. ``confirm``: its
+    motion waits for the code that is shown at the robot. ``report`` is the last it has said.
+    """
+
+    task: str
+    element: str
+    name: str
+    action: str
+    parameters: Later[Mapping[str, Value]]
+    since: str
+    waits: str
+    command: str
+    state: str
+    confirm: bool
+    report: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunHappening(_Answer):
+    """Something that happened in a run."""
+
+    number: int
+    at: str
+    kind: str
+    element: str
+    name: str
+    task: str
+    who: str
+    text: str
+    values: Later[Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Present(_Answer):
+    """A person who is there for a run."""
+
+    role: RunRole
+    who: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunDetail(_Answer):
+    """A run with what waits now and all that has happened; ``verdict`` is that of its record."""
+
+    run: RunLine
+    parameters: Later[Mapping[str, Value]]
+    people: Later[Sequence[PersonStep]]
+    robot: Later[Sequence[RobotStep]]
+    present: Later[Sequence[Present]]
+    needs: Later[Sequence[RunRole]]
+    holder: str
+    events: Later[Sequence[RunHappening]]
+    verdict: Later[Mapping[str, Any]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -46,6 +47,37 @@ class SystemClock:
             return None
         time_error = 5  # TIME_ERROR: the clock is not synchronised
         return None if state < 0 else state != time_error
+
+
+_TRIES, _EXACT_NS = 5, 50_000
+
+
+class StampConverter:
+    """Converts stamps of the kernel into log time: those of datagrams, frames and input events.
+
+    ``clock_id`` is the clock of the stamps: CLOCK_REALTIME for SO_TIMESTAMPNS and packet rings,
+    often CLOCK_MONOTONIC for input devices. A step of the wall clock between stamp and call moves a
+    time by the step, but neither into the future nor before an earlier one. One converter per
+    stream: its times never decrease.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], clock_id: int = time.CLOCK_REALTIME) -> None:
+        """``now_ns`` returns log time, as ``Sink.now_ns`` does."""
+        self._now_ns = now_ns
+        self._clock_id = clock_id
+        self._last_ns = 0
+
+    def log_ns(self, stamp_ns: int) -> int:
+        """Return the log time of a stamp, ns."""
+        for _ in range(_TRIES):
+            before_ns = time.clock_gettime_ns(self._clock_id)
+            now_ns = self._now_ns()
+            after_ns = time.clock_gettime_ns(self._clock_id)
+            if after_ns - before_ns < _EXACT_NS:  # else this thread was interrupted amid it
+                break
+        age_ns = max(0, (before_ns + after_ns) // 2 - stamp_ns)
+        self._last_ns = min(max(now_ns - age_ns, self._last_ns), now_ns)
+        return self._last_ns
 
 
 class LogClock(Protocol):

@@ -13,6 +13,7 @@ import hashlib
 import json
 import re
 import uuid
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NoReturn, TypeAlias
 
 import msgspec
@@ -20,6 +21,7 @@ from msgspec import Meta, Struct
 
 from amberbox.core import ed25519
 from amberbox.core.errors import AmberboxError
+from amberbox.core.units import in_unit
 
 Risk = Literal["record", "state", "moves"]
 # Ascending: who may order one risk may order those before it
@@ -33,12 +35,18 @@ FINAL = frozenset({"refused", "done", "failed", "aborted", "outcome_unknown", "e
 
 # Longest time to live that a robot accepts, seconds
 MOST_TTL_S = 60
+# The built-in action of a robot that installs a model of detectors; `sha256` names the file
+MODEL_INSTALL = "model.install"
 CHALLENGE_BYTES = 32
 # Largest encoded command, JSON text of its parameters, and JSON text of a result
 COMMAND_BYTES = 64 << 10
 PARAMETERS_BYTES = 32 << 10
 RESULT_BYTES = 64 << 10
 REASON_LENGTH = 1000
+# Limits of an ``OrderLimit``
+MOST_ORDERS = 100
+LEAST_PERIOD_S = 60.0
+MOST_PERIOD_S = 7 * 86_400.0
 _DEEPEST = 16
 _LARGEST = 2**62
 _DOMAIN = b"amberbox-command-1\0"
@@ -100,8 +108,9 @@ class CommandAnswer(Struct, frozen=True):
     """What the robot states about a command.
 
     ``result`` is JSON text, ``at_ns`` the robot's wall clock, ``mono_ns`` its time since ``boot``
-    began. ``number`` is the order of the robot's answers, from 1; 0 for a refusal that the
-    robot could not store, which comes again with a number, or that is about no command of it.
+    began. ``number`` is the order of the robot's answers, from 1; 0 for a refusal that the robot
+    could not store, which comes again with a number, or that is about no command of it, or about
+    one that it cannot read.
     """
 
     id: CommandId
@@ -112,6 +121,36 @@ class CommandAnswer(Struct, frozen=True):
     boot: Annotated[str, Meta(max_length=64)] = ""
     mono_ns: _Number = 0
     number: _Number = 0
+
+
+@dataclass(frozen=True, slots=True)
+class OrderLimit:
+    """How often a rule may order: ``most`` times in ``per_s`` seconds of the computer's uptime.
+
+    Orders from before the computer's start count as if made at its start, so that no clock and no
+    reboot shortens the time.
+    """
+
+    most: int
+    per_s: float
+
+    @classmethod
+    def from_text(cls, text: str) -> OrderLimit:
+        """Read ``3 per 1 h``; raises ValueError with a sentence for anything else."""
+        number, _, period = text.partition(" per ")
+        if not (number.strip().isdecimal() and period.strip()):
+            raise ValueError("is no limit; write: 3 per 1 h")
+        limit = cls(int(number), float(in_unit(period, "s")))
+        if not 1 <= limit.most <= MOST_ORDERS:
+            raise ValueError(f"must allow from 1 to {MOST_ORDERS} orders")
+        if not LEAST_PERIOD_S <= limit.per_s <= MOST_PERIOD_S:
+            raise ValueError("must be per 1 min or longer, up to per 7 d")
+        return limit
+
+    def __str__(self) -> str:
+        hours, minutes = self.per_s / 3600, self.per_s / 60
+        period = f"{hours:g} h" if hours >= 1 else f"{minutes:g} min"
+        return f"{self.most} per {period}"
 
 
 class LeaseState(Struct, frozen=True):
@@ -129,6 +168,15 @@ class LeaseState(Struct, frozen=True):
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
+
+
+class _WithId(Struct):
+    """A command of another version, as far as any version has to know it."""
+
+    id: CommandId
+
+
+_ID_DECODER: msgspec.msgpack.Decoder[_WithId] = msgspec.msgpack.Decoder(_WithId)
 
 
 def new_command_id() -> str:
@@ -160,6 +208,16 @@ def decode_command(data: bytes) -> Command:
     if command.risk == "record" and command.signature is not None:
         raise CommandError("a command of risk record is not signed")
     return command
+
+
+def unread_id(data: bytes) -> str:
+    """Return the id in data that ``decode_command`` refuses; empty where there is none."""
+    if len(data) > COMMAND_BYTES:
+        return ""
+    try:
+        return _ID_DECODER.decode(data).id
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return ""
 
 
 def read_parameters(text: str) -> dict[str, Any]:

@@ -197,6 +197,7 @@ class ConditionWatcher:
         self._samples = {a: _series_of(a) for c in conditions.values() for a in addresses_of(c)}
         self._was_true = dict.fromkeys(conditions, False)
         self._until_ns = _LONG_AGO
+        self._last_ns: dict[str, int] = {}  # of each item
         self.problems: dict[str, str] = {}
 
     @property
@@ -222,8 +223,21 @@ class ConditionWatcher:
         return max(depths, default=0)
 
     def add(self, batch: Batch, times_ns: IntArray | None = None) -> None:
-        """Add the rows of a batch and of its child tables."""
+        """Add the rows of a batch and of its child tables.
+
+        Rows of an item with the same time are set apart by a nanosecond, so that each counts: a
+        writer may have stamped several at once.
+        """
         times_ns = batch.received_ns if times_ns is None else times_ns
+        if not len(times_ns):
+            return
+        place = np.arange(len(times_ns))
+        first_ns = self._last_ns.get(batch.item, _LONG_AGO) + 1
+        apart_ns = np.maximum(np.maximum.accumulate(times_ns - place), first_ns) + place
+        self._last_ns[batch.item] = int(apart_ns[-1])
+        self._add(batch, apart_ns)
+
+    def _add(self, batch: Batch, times_ns: IntArray) -> None:
         for samples in self._samples.values():
             if samples.item == batch.item:
                 try:
@@ -232,7 +246,7 @@ class ConditionWatcher:
                     self.problems.setdefault(samples.address, f"'{samples.address}' {error}")
         for child in batch.children.values():
             place = np.searchsorted(batch.seq, child.seq)
-            self.add(child, times_ns[place])
+            self._add(child, times_ns[place])
 
     @property
     def true(self) -> list[str]:
@@ -248,6 +262,7 @@ class ConditionWatcher:
         """Forget all rows, as at the start of a run, but not which conditions were true."""
         self._samples = {address: _series_of(address) for address in self._samples}
         self._until_ns = _LONG_AGO
+        self._last_ns.clear()
 
     def edges(self, until_ns: int) -> list[RisingEdge]:
         """Return the conditions that became true since the last call, up to ``until_ns``, by time.
@@ -405,6 +420,32 @@ def _output(columns: Mapping[str, Any], row: int) -> Value:
 def _series_of(address: str) -> _AddressSeries:
     output = of_monitors(address)
     return _AddressSeries(address) if output is None else _StatusSeries(address, *output)
+
+
+def value_after(
+    expression: Expression, batches: Iterable[Batch], known: Mapping[str, Value]
+) -> Value:
+    """Return the value of an expression after the last row; None where it is unknown.
+
+    Addresses are those of ``ConditionWatcher``; names in ``known`` have the values given there.
+    Raises UsageError for values of a wrong type.
+    """
+    samples = [_series_of(name) for name in expression.addresses() if name not in known]
+    last_ns = _LONG_AGO
+    for batch in batches:
+        last_ns = max([last_ns, *batch.received_ns[-1:].tolist()])
+        for part in batch_and_children(batch):
+            times_ns = batch.received_ns[np.searchsorted(batch.seq, part.seq)]
+            for one in samples:
+                if one.item == part.item:
+                    one.add(part, times_ns)
+    series = {one.address: one.series() for one in samples}
+    for name in known:
+        series[name] = (np.array([_LONG_AGO], np.int64), single_value(known[name]))
+    found: Value = expression.evaluate_series(
+        {name: series[name] for name in expression.addresses()}, last_ns
+    )
+    return found
 
 
 def item_of(address: str) -> str:

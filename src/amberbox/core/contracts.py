@@ -11,23 +11,26 @@ probe                  ``monitoring/probes``      ``core.probe``
 publisher of statuses  ``monitoring/publishers``  ``Publisher``
 provider of evidence   ``diagnosis/evidence``     ``EvidenceProvider`` and what is named below
 action of a robot      ``experiments/actions``    ``Action`` and what is named below it
+detector               ``detection/detectors``    ``Detector`` and what is named above it
 =====================  =========================  ========================================
 
 The name of a provider of evidence is also that of the engine if it answers alone. It defines one
 or more of
 
-- ``needs`` and ``provide`` (``EvidenceProvider``): ``amberbox diagnose`` and the server call it for
-  an instant;
+- ``needs`` and ``provide`` (``EvidenceProvider``): called for an instant, by the tracker when the
+  evidence has changed, and by ``amberbox diagnose`` and the server where no tracker has asked it;
 - ``follow`` (``FollowedEvidence``): the tracker calls it as a record grows, live and in replay;
 - ``alone`` and the three texts of ``EvidenceEngine``: it can answer without the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+
+from numpy.typing import NDArray
 
 from amberbox.core.mode import Result
 from amberbox.core.types import Batch, Diagnosis, Status, Symptom
@@ -38,11 +41,15 @@ Span: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """A conflict: failure modes of which at least one is present, and why."""
+    """A conflict: failure modes of which at least one is present, and why.
+
+    ``finding`` is the id under which it is recorded; without one it is named after its faults.
+    """
 
     faults: frozenset[str]
     source: str
     proof: str = ""
+    finding: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +77,15 @@ class EvidenceNeeds:
     """The input that a provider needs: how many seconds of the record before the instant.
 
     A provider that needs no ``symptoms`` is called first, and its finding on a symptom replaces the
-    one that was read. The others are called one by one, each with all evidence known by then.
+    one that was read. The others are called one by one, each with all evidence known by then. The
+    tracker calls one with a history every ten seconds as well, any other only when the symptoms
+    have changed: its evidence must be a function of them. What one found that ``reads_symptoms``
+    not, but only the record, stays as it is when a user adds symptoms.
     """
 
     history_s: float = 0.0
     symptoms: bool = True
+    reads_symptoms: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +99,13 @@ class GivenEvidence:
 NOTHING_GIVEN = GivenEvidence()
 
 
+class OutOfTimeError(Exception):
+    """A budget was over before the search had ended."""
+
+
+_TIME_BITS = 11
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """Limits of a search; each engine uses those that it has.
@@ -97,17 +115,54 @@ class Budget:
     A step is a goal that is run or tried again, a fact that is derived, or eight characters of a
     text or one element of a list that a built-in predicate makes. ``is_over`` is called now and
     then and returns True when the caller wants the search to end, since engines read no clock; the
-    default, ``bool``, never does.
+    default, ``bool``, never does. ``is_past`` returns whether a share of the time, from 0 to 1, is
+    over; engines that have a second way to an answer leave time for it.
     """
 
     nodes: int | None = None
     is_over: Callable[[], bool] = bool
     steps: int = 5_000_000
     depth: int = 400_000
+    is_past: Callable[[float], bool] | None = None
+
+    def until(self, share: float) -> Budget:
+        """Return this budget with a share of its time; unchanged where shares are not known."""
+        past = self.is_past
+        return self if past is None else replace(self, is_over=lambda: past(share))
+
+    def turn(self, to_come: int) -> Budget:
+        """Return the budget of a search that shares the time with others, ``to_come`` after it.
+
+        It has half of the time that is left, so that one that takes long leaves time for the
+        others; the last one has all of it.
+        """
+        past = self.is_past
+        if past is None or not to_come:
+            return self
+        gone = self.time_gone()
+        left = (1.0 - gone) / 2
+        return replace(
+            self,
+            is_over=lambda: past(gone + left),
+            is_past=lambda share: past(gone + share * left),
+        )
+
+    def time_gone(self) -> float:
+        """Return the share of the time that is over, to 0.1 %; 0 where shares are not known."""
+        gone = 0.0
+        for power in range(1, _TIME_BITS):
+            if self.is_past is not None and self.is_past(gone + 0.5**power):
+                gone += 0.5**power
+        return gone
 
     def most_nodes(self, default: int) -> int:
         """Return the most nodes, given the default of the engine."""
         return default if self.nodes is None else self.nodes
+
+    def check(self) -> None:
+        """Raise OutOfTimeError if the caller wants the search to end."""
+        if self.is_over():
+            raise OutOfTimeError
 
 
 class RecordedPast(Protocol):
@@ -126,7 +181,9 @@ class RecordedPast(Protocol):
         """Return the runs of the watcher, nanoseconds."""
 
     def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
-        """Yield the rows that the box itself wrote on a channel, with the time ``received``."""
+        """Yield the rows of an item, or that the box itself wrote on a channel, with the time
+        ``received``.
+        """
 
 
 class EvidenceWindow(Protocol):
@@ -252,6 +309,7 @@ class ModeContract:
     parts: bool = False
     probe: str = ""
     timed: Callable[[Any], bool] | None = None
+    in_silence: Callable[[Any], bool] | None = None
     history_s: Callable[[Any], float] | None = None
     shortest_s: Callable[[Any], float] | None = None
     results_of: Callable[[Any, int, int], Sequence[Result]] | None = None
@@ -260,6 +318,8 @@ class ModeContract:
     explain: Callable[..., str] | None = None
     reason: Callable[..., str] | None = None
     explain_unknown: Callable[..., str] | None = None
+    input_problems: Callable[[Any, Sequence[str]], Iterable[tuple[str, str]]] | None = None
+    in_folder: Callable[[Any, Path], Any] | None = None
 
     @classmethod
     def of(cls, module: Any) -> ModeContract:
@@ -271,6 +331,10 @@ class ModeContract:
     def is_timed(self, config: Any) -> bool:
         """Return whether its results change as time passes, without a new sample."""
         return self.always_timed if self.timed is None else self.timed(config)
+
+    def is_called_in_silence(self, config: Any) -> bool:
+        """Return whether it is called also where its inputs are stale."""
+        return self.sees_silence if self.in_silence is None else self.in_silence(config)
 
     def looks_back_s(self, config: Any) -> float:
         """Return how far back it looks, in seconds; 0 if it does not."""
@@ -289,10 +353,13 @@ class ModeContract:
 class Publisher(Protocol):
     """A message format for statuses, one file in ``monitoring/publishers``."""
 
-    def messages(self, statuses: Sequence[Status], naming: Any) -> list[dict[str, Any]]:
+    def messages(
+        self, statuses: Sequence[Status], naming: Any, diagnosis: Diagnosis | None = None
+    ) -> list[dict[str, Any]]:
         """Return the messages that carry the statuses of a robot at one time.
 
-        ``naming`` (``monitoring.plan.Naming``) has the names of components and modes.
+        ``naming`` (``monitoring.plan.Naming``) has the names of components and modes;
+        ``diagnosis`` is the open one.
         """
 
 
@@ -341,3 +408,126 @@ class Action(Protocol[ConfigT]):
         Raises AmberboxError if it failed, NotStartedError if the robot has not been told anything.
         It polls ``context.stopped()`` at least every 0.1 s and returns soon after it is true.
         """
+
+
+class Row(NamedTuple):
+    """One message of an item, as detectors read it.
+
+    ``at_ns`` is its time of arrival (``received``, ns), ``stamp_ns`` its own stamp, or ``at_ns`` if
+    it has none. ``values`` are its numbers by variable, also NaN and infinite ones; what is null or
+    absent is left out. ``texts`` are its texts, for events.
+    """
+
+    item: str
+    at_ns: int
+    stamp_ns: int
+    values: Mapping[str, float]
+    texts: Mapping[str, str] = {}
+
+
+class MissionRows(Protocol):
+    """The rows of a mission, in the order of their arrival; they can be read more than once."""
+
+    @property
+    def name(self) -> str:
+        """Return its name, for reports."""
+
+    @property
+    def span(self) -> Span:
+        """Return its start and end (times of arrival, ns)."""
+
+    def __iter__(self) -> Iterator[Row]:
+        """Yield its rows."""
+
+
+class Score(NamedTuple):
+    """How abnormal one series of a detector is at a time: from 0, of the order of 1 if nominal.
+
+    A series is what has a threshold of its own: a source, a variable, a group, the whole robot. Its
+    name is the same in every mission.
+    """
+
+    at_ns: int
+    series: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreReason:
+    """Why a score is high: the id of the alarm is ``detector.finding.item[.variable]``.
+
+    ``contributions`` are the shares of variables or events, the greatest first; ``transitions`` the
+    last ones before the alarm, the newest last; ``suspects`` the members of which at least one is
+    faulty, where the detector knows that, and ``conflict`` the addresses of what is measured at
+    them. ``text`` is one sentence with values and limits.
+    """
+
+    finding: str
+    item: str
+    variable: str = ""
+    text: str = ""
+    contributions: tuple[tuple[str, float], ...] = ()
+    transitions: tuple[str, ...] = ()
+    suspects: tuple[str, ...] = ()
+    conflict: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LearntState:
+    """What a detector has learnt: values for JSON, and arrays of numbers (no objects)."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+class Detector(Protocol):
+    """Learns from nominal missions and scores rows; the class ``Detector`` of its module.
+
+    ``Detector(config)`` takes the module's ``Config``, a frozen dataclass of ``option`` fields with
+    defaults. Thresholds, baselines, persistence, alarms and files are ``amberbox.detection``'s.
+
+    It is given one row at a time, so that the scores of a stream are those of a batch. ``at_ns``
+    never decreases within a mission; stamps may be late or step. Hostile input raises nothing: what
+    cannot be used is counted in ``counts``, by a text such as ``values that are not finite``.
+
+    Scores are also judged against the past of their mission, as they may be greater in one mission
+    than in another; not those of a detector with ``own_baseline = False``.
+    """
+
+    version: int
+    """Of what ``learnt`` returns; a file of another version is refused."""
+    counts: dict[str, int]
+    """What could not be used since the detector was made."""
+
+    def fit(self, missions: Sequence[MissionRows]) -> None:
+        """Learn from nominal missions, and forget what was learnt before.
+
+        Raises AmberboxError if there is nothing to learn from.
+        """
+
+    def begin(self, at_ns: int) -> None:
+        """Begin a mission: forget the rows before it."""
+
+    def observe(self, row: Row) -> Sequence[Score]:
+        """Return the scores that a row changes, at its time of arrival."""
+
+    def tick(self, now_ns: int) -> Sequence[Score]:
+        """Return the scores that change because time passes; called twice a second.
+
+        All rows that arrived before ``now_ns`` have been observed.
+        """
+
+    def explain(self, series: str) -> ScoreReason:
+        """Return the reason of the last score of a series."""
+
+    def learnt(self) -> LearntState:
+        """Return what was learnt, with the options that scores depend on."""
+
+    def restore(self, state: LearntState) -> None:
+        """Restore what was learnt; raise ValueError, KeyError or TypeError if it does not fit."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state within a mission, as JSON, for ``resume``; it is exact."""
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue where ``snapshot`` was taken; raises as ``restore`` does."""

@@ -22,6 +22,7 @@ from amberbox.core.expressions.evaluation import (
     InstantView,
     Series,
     Track,
+    WindowCache,
     at_instant,
     evaluate,
     rows_of,
@@ -141,7 +142,11 @@ class Expression:
         now = np.zeros(1, np.int64)
         with _located(self.text):
             series = series_of(self._reads, {n: (now, [value]) for n, value in values.items()})
-            return self._at_instant(self._tracks(series), 0, has_time=False)
+            for part in walk(self.tree) if self.needs_history else ():
+                if isinstance(part, WindowNode | HeldNode | AgeNode):
+                    what = "needs the past, only current values are known here"
+                    raise ExpressionFault(what, part.at)
+            return self._at_instant(self._tracks(series), 0)
 
     def evaluate_columns(self, times_ns: IntArray, columns: Mapping[str, Any]) -> NDArray[Any]:
         """Return its value for each row of columns that share their time stamps.
@@ -178,7 +183,7 @@ class Expression:
         self,
         samples: Mapping[str, Samples],
         at_ns: int | IntArray,
-        windows: dict[str, Any] | None = None,
+        windows: WindowCache | None = None,
     ) -> Any:
         """Return the same as numbers, bools as 0 and 1: NaN where it is unknown.
 
@@ -202,20 +207,19 @@ class Expression:
         return [_track_of(address, series[address.name]) for address in self._reads]
 
     def _at_instants(
-        self, tracks: list[Track], at_ns: int | IntArray, windows: dict[str, Any] | None = None
+        self, tracks: list[Track], at_ns: int | IntArray, windows: WindowCache | None = None
     ) -> Values:
         series = {name: t.series() for name, t in zip(self._names, tracks, strict=True)}
-        known = {} if windows is None else windows
+        known = WindowCache() if windows is None else windows
         return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64), windows=known))
 
     def _at_instant(
         self,
         tracks: list[Track],
         at_ns: int,
-        has_time: bool = True,
-        windows: dict[str, Any] | None = None,
+        windows: WindowCache | None = None,
     ) -> Value:
-        view = InstantView(at_ns, dict(zip(self._names, tracks, strict=True)), has_time, windows)
+        view = InstantView(at_ns, dict(zip(self._names, tracks, strict=True)), windows)
         kinds = view.take(self._current)
         function = self._functions.get(kinds)
         if function is None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import os
+import select
 import stat
 import time
+from collections.abc import Iterable
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol, TypeVar
 
 from amberbox.core.errors import AmberboxError
 
@@ -34,6 +36,23 @@ def _is_file_name(part: str) -> bool:
     return part not in ("", ".", "..") and "\0" not in part and size <= _LONGEST_NAME
 
 
+def read_at_most(path: Path, most_bytes: int, hint: str) -> bytes:
+    """Read a whole file that a person has named.
+
+    Raises AmberboxError for one that cannot be read, or that is longer (with the hint).
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except OSError as error:
+        raise AmberboxError(
+            f"cannot read {path}: {error.strerror}", "check the path and its permissions"
+        ) from None
+    if len(data) > most_bytes:
+        raise AmberboxError(f"{path} has more than {most_bytes >> 20} MiB", hint)
+    return data
+
+
 def keep_to_group() -> None:
     """Make what this process creates unreadable for others: folders 0750, files 0640 at most.
 
@@ -49,11 +68,11 @@ def open_to_all(path: Path) -> str:
     return f"everybody on this computer can read {path} (mode {mode:04o})" if mode & 0o007 else ""
 
 
-def replace_file(path: Path, text: str) -> None:
+def replace_file(path: Path, content: str | bytes) -> None:
     """Write a small file so that a power cut leaves the old or the new one."""
     part = path.with_name(path.name + ".part")
-    with part.open("w") as file:
-        file.write(text)
+    with part.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
@@ -127,3 +146,26 @@ def is_file_locked(path: Path) -> bool:
     except OSError:
         return True
     return False
+
+
+ReadableT = TypeVar("ReadableT", bound="int | HasFileno")
+
+
+class HasFileno(Protocol):
+    """A file, a pipe or a socket."""
+
+    def fileno(self) -> int:
+        """Return the file descriptor."""
+
+
+def wait_readable(files: Iterable[ReadableT], timeout_s: float | None = None) -> list[ReadableT]:
+    """Wait until one can be read or has ended, at most so long; return those for which it is so.
+
+    Unlike ``select.select`` it takes file descriptors above 1023.
+    """
+    by_fileno = {one if isinstance(one, int) else one.fileno(): one for one in files}
+    waiting = select.poll()
+    for number in by_fileno:
+        waiting.register(number, select.POLLIN)
+    found = waiting.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000.0)
+    return [by_fileno[number] for number, _ in found]

@@ -20,13 +20,19 @@ machine. It may also define
 - ``TIMED = True``, or ``timed(config)``: the results change as time passes, also without a new
   sample; it is then called every quarter of a second, not with every sample, but with both where
   it looks back less than half a second: no sample passes through such a window unseen;
-- ``SEES_SILENCE = True``: it is called also where its inputs are stale;
+- ``SEES_SILENCE = True``, or ``in_silence(config)``: it is called also where its inputs are stale;
 - ``PARTS = True``: an ``item`` input brings all columns of its rows in ``parts``;
 - ``history_s(config)``: how far back it looks, in seconds; ``shortest_s(config)``: its shortest
   window, where that is another one;
 - ``results_of(config, inputs, bools)``: the results of a mapping, where they depend on the
   arguments or on how many inputs and bool outputs it has (ints); outputs are bound to these, and
   ``RESULTS`` are those that it always has;
+- ``input_problems(config, texts)``: argument and reason where arguments do not fit the inputs of
+  the mode file, as ``check`` of a configuration does;
+- ``measure(config, result, inputs)``: an expression of how large a fault of a result is, from the
+  addresses of the inputs, or the name of another result; signed, empty where nothing says so;
+- ``in_folder(config, folder)``: the arguments with what a file of the robot folder adds to them;
+  all other functions get these. Raises AmberboxError where the file has mistakes;
 - ``reads(config)``: further addresses that it reads; they follow the inputs of the mapping;
 - ``probe_of(config, text)``: kind and subject of the probe that an input means which is no
   recorded variable; without it ``PROBE`` is the kind and the text is the subject;
@@ -168,6 +174,15 @@ def as_single(number: float) -> float:
     with np.errstate(over="ignore"):
         rounded = float(np.float32(number))
     return rounded if isfinite(rounded) else float(number)
+
+
+def beyond_limits(value: str, low: float, high: float) -> str:
+    """Return the expression of a value minus the limit that it violates; 0 between the limits."""
+    if low == high:
+        return f"{value} - {low!r}"
+    above = f"max({value} - {high!r}, 0)" if isfinite(high) else ""
+    below = f"min({value} - {low!r}, 0)" if isfinite(low) else ""
+    return " + ".join(filter(None, (above, below)))
 
 
 def where_known(known: Any, value: Any) -> Any:

@@ -31,7 +31,8 @@ Later: TypeAlias = Annotated[_T, Missing()]
 class Schema:
     """A message definition as the source gave it (the fields of an MCAP schema).
 
-    ``encoding`` is ``ros1msg``, ``ros2msg``, ``ros2idl``, ``jsonschema`` or another MCAP name.
+    ``encoding`` is ``ros1msg``, ``ros2msg``, ``ros2idl``, ``protobuf``, ``jsonschema`` or another
+    MCAP name, or ``amberbox_layout`` (``blackbox.columns.frame_layout``).
     """
 
     name: str
@@ -43,8 +44,9 @@ class Schema:
 class Topic:
     """One stream as a source found it on its bus.
 
-    ``message_encoding`` is MCAP's: ``ros1``, ``cdr``, ``json``, ``msgpack``. For ``json`` and
-    ``msgpack`` the schema may be None: the recorder infers it and widens it when it must.
+    ``message_encoding`` is MCAP's: ``ros1``, ``cdr``, ``protobuf``, ``json``, ``msgpack``, or
+    ``frame`` for the raw frames of a bus. For ``json`` and ``msgpack`` the schema may be None: the
+    recorder infers it and widens it when it must.
     """
 
     name: str
@@ -174,6 +176,7 @@ class Batch:
 
     ``timestamp_ns`` is the item's own stamp, else ``received_ns`` (the paper's rule);
     ``received_ns`` is the corrected time of receipt, ``log_time_ns`` the time in the journal.
+    ``encoding`` is that of the messages, empty if only their columns are left.
     """
 
     item: str
@@ -189,6 +192,7 @@ class Batch:
     cursor: Cursor = field(default_factory=Cursor)
     topic: str = ""
     source: str = ""
+    encoding: str = ""
 
     def __len__(self) -> int:
         return len(self.seq)
@@ -285,7 +289,8 @@ class Symptom:
     trust in the observation (1: full). ``evidence`` names the measured data: address, from and to.
     ``blocked_by`` names dependencies of its component that are not ok: then it is no evidence.
     ``reason`` gives the measured value and its limit, if known. ``gone_ns`` is when a symptom
-    disappeared that is still remembered: it continues to count for a while.
+    disappeared that is still remembered: it continues to count for a while. ``size`` is how large a
+    present symptom is, signed, in the unit that the FMEA states; None if that is not known.
     """
 
     id: str
@@ -299,6 +304,7 @@ class Symptom:
     blocked_by: tuple[str, ...] = ()
     reason: str = ""
     gone_ns: int | None = None
+    size: float | None = None
 
 
 UNKNOWN_FAULT: Final = "unknown#other"  # stands for every failure mode that is not in the FMEA
@@ -308,7 +314,8 @@ UNKNOWN_FAULT: Final = "unknown#other"  # stands for every failure mode that is 
 class Hypothesis:
     """A set of failure modes (``component#mode``) as a possible cause.
 
-    ``ambiguity`` are the ids of hypotheses that no symptom distinguishes from this one.
+    ``ambiguity`` are the ids of hypotheses that no symptom distinguishes from this one. ``follows``
+    are those of its faults that may have followed from others of them: they are no further faults.
     """
 
     id: str
@@ -320,23 +327,32 @@ class Hypothesis:
     ambiguity: tuple[str, ...] = ()
     proof: str = ""
     criticality: float = 0.0
+    follows: frozenset[str] = frozenset()
+
+
+RunKind: TypeAlias = Literal["experiment", "unit_test"]
+"""Kinds of tests that are run: by a robot, or with it; people answer the others."""
+TestKind: TypeAlias = Literal["read", "question", "check"] | RunKind
 
 
 @dataclass(frozen=True, slots=True)
 class Test:
     """A reading, question, check or experiment that gives more information.
 
-    ``gain_bits`` is the expected information, ``outcomes`` the probability of each answer.
+    ``gain_bits`` is the expected information, ``outcomes`` the probability of each answer. ``run``
+    is the name of the experiment or unit test, ``moves`` whether the robot moves in it.
     """
 
     id: str
-    kind: Literal["read", "question", "check", "experiment", "unit_test"]
+    kind: TestKind
     text: str
     role: str = ""
     cost_s: float = 0.0
     risk: float = 0.0
     gain_bits: float = 0.0
     outcomes: Mapping[str, float] = field(default_factory=dict)
+    run: str = ""
+    moves: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,7 +378,8 @@ class Diagnosis:
     failure mode. ``symptoms`` are the present ones, in order of onset; once all have healed the
     last revision has the ``state`` healed and keeps the last answer. ``live_only`` marks a record
     that a replay does not reproduce: repeated in a new file, or ended by a restart. ``make_safe``
-    are the actions of the FMEA that are needed before any of ``next_tests``.
+    are the actions of the FMEA that are needed before any of ``next_tests``. ``asked`` are the
+    providers of evidence that a tracker has asked: their findings are among its evidence.
     """
 
     id: str
@@ -380,6 +397,7 @@ class Diagnosis:
     state: Literal["open", "healed"] = "open"
     live_only: bool = False
     make_safe: tuple[str, ...] = ()
+    asked: tuple[str, ...] = ()
 
     def members(self, group: AmbiguityGroup) -> tuple[Hypothesis, ...]:
         """Return the hypotheses of a group."""

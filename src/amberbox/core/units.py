@@ -19,6 +19,9 @@ TIME_NS: Mapping[str, int] = {
     "d": 86_400_000_000_000,
 }
 
+PER_SECOND = "1/s"
+"""Unit of a change per second of anything."""
+
 _BYTES: Mapping[str, int] = {
     **{"B": 1, "kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12},
     **{"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40},
@@ -48,6 +51,21 @@ def in_unit(text: str, unit: str) -> Fraction:
     if written not in units:
         raise ValueError(_unknown_unit(written, units))
     return number * units[written] / units[unit]
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a change per second: ``m/s^2`` for ``m/s``."""
+    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+
+
+def is_same_unit(one: str, other: str) -> bool:
+    """Return whether two units are the same; ``m/s^2`` is also written ``m/s2`` and ``m/s²``."""
+    return _spelt(one) == _spelt(other)
+
+
+def _spelt(unit: str) -> str:
+    spelt = "".join(unit.split()).replace("²", "^2").replace("/s/s", "/s^2")
+    return re.sub(r"/s2$", "/s^2", spelt)
 
 
 def duration_ns(number: str, unit: str) -> int:

@@ -14,7 +14,7 @@ import yaml
 
 from amberbox.core.errors import Problem
 
-Scalar: TypeAlias = "str | int | float | bool | None"
+Scalar: TypeAlias = str | int | float | bool | None
 
 _FENCE: ContextVar[Path | None] = ContextVar("fence", default=None)
 _OURS = Path(__file__).resolve().parents[1]

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from struct import Struct, error
+from struct import Struct
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amberbox.blackbox.columns.arrays import objects, offsets_of
+from amberbox.blackbox.columns.layout_cache import MISFITS, LayoutGroup
 from amberbox.blackbox.columns.ros_definition import SIZES
 from amberbox.blackbox.columns.ros_wire import (
     ChildrenOp,
@@ -38,9 +39,6 @@ from amberbox.core.types import IntArray
 Slots: TypeAlias = list[list[int]]
 MessageWalk: TypeAlias = Callable[[bytes, int, int], None]
 Walker: TypeAlias = Callable[..., MessageWalk]
-
-# raised by a walk on a message that does not fit its definition
-MISFITS = (ValueError, IndexError, error)
 
 # most rows of structures without a byte: no message size limits their claimed number
 _MOST_EMPTY_ROWS = 1 << 8
@@ -248,7 +246,7 @@ def decode_text(data: bytes, wide: bool, big_endian: bool) -> str:
     return units.tobytes().decode("utf-16-le", "replace")
 
 
-def _gather(data: bytes, places: IntArray, size: int) -> Bytes:
+def gather(data: bytes | Bytes, places: IntArray, size: int) -> Bytes:
     """Return ``size`` bytes from each place, concatenated."""
     if not len(places) or not size:
         return np.empty(0, np.uint8)
@@ -256,9 +254,9 @@ def _gather(data: bytes, places: IntArray, size: int) -> Bytes:
     return pieces[places].view(np.uint8)
 
 
-def _join_spans(data: bytes, starts: IntArray, counts: IntArray, width: int) -> Bytes:
+def join_spans(data: bytes, starts: IntArray, counts: IntArray, width: int) -> Bytes:
     if len(counts) and (counts == counts[0]).all():
-        return _gather(data, starts, int(counts[0]) * width)
+        return gather(data, starts, int(counts[0]) * width)
     ends = (starts + counts * width).tolist()
     parts = [data[start:end] for start, end in zip(starts.tolist(), ends, strict=True)]
     return np.frombuffer(bytearray().join(parts), np.uint8)
@@ -274,14 +272,14 @@ class ScatteredPlaces:
 
     def pieces(self, slot: int, size: int) -> FixedPieces:
         places = np.array(self.slots[slot], np.int64)
-        return FixedPieces(_gather(self.data, places, size), 0, size, len(places))
+        return FixedPieces(gather(self.data, places, size), 0, size, len(places))
 
     def offsets(self, slot: int) -> IntArray:
         return offsets_of(np.array(self.slots[slot], np.int64))
 
     def spans(self, starts: int, counts: int, width: int) -> Bytes:
         places = np.array([self.slots[starts], self.slots[counts]], np.int64)
-        return _join_spans(self.data, places[0], places[1], width)
+        return join_spans(self.data, places[0], places[1], width)
 
     def blobs(self, starts: int, counts: int) -> list[bytes]:
         places = zip(self.slots[starts], self.slots[counts], strict=True)
@@ -319,7 +317,7 @@ class EvenPlaces:
         if len(places) == 1:
             return FixedPieces(self.data, places[0], self.size, self.count)
         everywhere = self._spread(slot)
-        return FixedPieces(_gather(self.data, everywhere, size), 0, size, len(everywhere))
+        return FixedPieces(gather(self.data, everywhere, size), 0, size, len(everywhere))
 
     def offsets(self, slot: int) -> IntArray:
         counts = self.slots[slot]
@@ -329,7 +327,7 @@ class EvenPlaces:
 
     def spans(self, starts: int, counts: int, width: int) -> Bytes:
         if len(self.slots[starts]) != 1:
-            return _join_spans(self.data, self._spread(starts), self._repeat(counts), width)
+            return join_spans(self.data, self._spread(starts), self._repeat(counts), width)
         start, length = self.slots[starts][0], self.slots[counts][0] * width
         return self._block(start, length).copy().reshape(-1)
 
@@ -379,11 +377,9 @@ class EvenPlaces:
         return np.add.outer(bases, np.array(self.slots[slot], np.int64)).reshape(-1)
 
 
-MOST_LAYOUTS = 8
 _MOST_SPANS = 32
 # bytes between a string and the next prefix that are compared as if they belonged to it
 _PADDING = 3
-_MESSAGES_PER_NEW_LAYOUT = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -425,11 +421,16 @@ def _column(data: bytes, size: int, count: int, place: int, length: int) -> NDAr
     return np.ndarray((count, length), np.uint8, data, place, (size, 1))
 
 
-def find_layout(plan: WirePlan, walker: Walker, message: bytes, big_endian: bool) -> ByteLayout:
-    """Return the layout of a message; raises one of ``MISFITS`` if it does not fit its definition.
+def layout_finder(plan: WirePlan) -> Callable[[bytes], ByteLayout]:
+    """Compile a function that returns the layout of a message.
 
-    ``walker`` is one compiled with ``watch``.
+    It raises one of ``MISFITS`` if the message does not fit its definition.
     """
+    walker = compile_walker(plan, watch=True)
+    return lambda message: _find_layout(plan, walker, message, is_big_endian(plan, message))
+
+
+def _find_layout(plan: WirePlan, walker: Walker, message: bytes, big_endian: bool) -> ByteLayout:
     slots: Slots = [[] for _ in range(plan.slots)]
     checks: list[tuple[int, int]] = [(0, 2)] if plan.cdr else []
     walker(big_endian, slots, checks)(message, 0, len(message))
@@ -462,108 +463,12 @@ def _merged(
     return tuple((start, message[start:end]) for start, end in merged)
 
 
-class TooManyLayoutsError(Exception):
-    """Raised when messages of a topic differ too often for layouts to save time."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LayoutGroup:
-    """Messages of a batch that share a layout: their numbers and their joined bytes.
-
-    ``same_texts`` is True if all their strings are those of the layout.
-    """
-
-    layout: ByteLayout
-    members: NDArray[np.int64]
-    data: bytes
-    same_texts: bool = False
-
-    def places(self) -> EvenPlaces:
-        """Return the places of their fields."""
-        layout = self.layout
-        texts = layout.texts if self.same_texts else None
-        count = len(self.members)
-        return EvenPlaces(self.data, layout.size, count, layout.slots, layout.big_endian, texts)
-
-
-class LayoutCache:
-    """The ``MOST_LAYOUTS`` most recently used layouts of one topic.
-
-    A topic may need a new layout now and then (a name that changes). When it needs one more often
-    than once in 256 messages, ``TooManyLayoutsError`` is raised.
-    """
-
-    def __init__(self, plan: WirePlan) -> None:
-        self._plan = plan
-        self._walker = compile_walker(plan, watch=True)
-        self._recent: list[ByteLayout] = []
-        self._new_left = float(MOST_LAYOUTS)
-
-    def group(
-        self, messages: Sequence[bytes], lengths: list[int]
-    ) -> tuple[list[LayoutGroup], list[int]]:
-        """Split a batch by layout; also return the numbers of messages that fit no layout."""
-        self._new_left = min(
-            MOST_LAYOUTS, self._new_left + len(messages) / _MESSAGES_PER_NEW_LAYOUT
-        )
-        groups: list[LayoutGroup] = []
-        bad: list[int] = []
-        for members in _by_size(lengths):
-            rest = members
-            while len(rest):
-                rest = self._next_group(messages, rest, groups, bad)
-        return groups, bad
-
-    def _next_group(
-        self,
-        messages: Sequence[bytes],
-        members: NDArray[np.int64],
-        groups: list[LayoutGroup],
-        bad: list[int],
-    ) -> NDArray[np.int64]:
-        """Append the group of messages with the first member's layout; return the other members."""
-        first = int(members[0])
-        try:
-            layout = self._layout_of(messages[first])
-        except MISFITS:
-            bad.append(first)
-            return members[1:]
-        data = _join(messages, members)
-        if layout.repeats(data, len(members)):
-            groups.append(LayoutGroup(layout, members, data, True))
-            return members[:0]
-        matching = layout.matches(data, len(members))
-        if matching.all():
-            groups.append(LayoutGroup(layout, members, data))
-            return members[:0]
-        groups.append(LayoutGroup(layout, members[matching], _join(messages, members[matching])))
-        return members[~matching]
-
-    def _layout_of(self, message: bytes) -> ByteLayout:
-        for place, layout in enumerate(self._recent):
-            if layout.size == len(message) and layout.fits(message):
-                self._recent.insert(0, self._recent.pop(place))
-                return layout
-        layout = find_layout(self._plan, self._walker, message, is_big_endian(self._plan, message))
-        if self._new_left < 1:
-            raise TooManyLayoutsError
-        self._new_left -= 1
-        self._recent.insert(0, layout)
-        del self._recent[MOST_LAYOUTS:]
-        return layout
-
-
-def _by_size(lengths: list[int]) -> list[NDArray[np.int64]]:
-    if lengths.count(lengths[0]) == len(lengths):
-        return [np.arange(len(lengths))]
-    sizes = np.array(lengths)
-    return [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
-
-
-def _join(messages: Sequence[bytes], members: NDArray[np.int64]) -> bytes:
-    if len(members) == len(messages):
-        return b"".join(messages)
-    return b"".join([messages[member] for member in members.tolist()])
+def places_of(group: LayoutGroup[ByteLayout]) -> EvenPlaces:
+    """Return the places of the fields of messages of one layout."""
+    layout = group.layout
+    texts = layout.texts if group.same_texts else None
+    count = len(group.members)
+    return EvenPlaces(group.data, layout.size, count, layout.slots, layout.big_endian, texts)
 
 
 def is_big_endian(plan: WirePlan, message: bytes) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from struct import Struct
 from typing import Any
@@ -11,24 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amberbox.blackbox.columns import UnrollError
-from amberbox.blackbox.columns.arrays import (
-    concatenate,
-    numpy_type,
-    objects,
-    offsets_of,
-    ranges,
-    take,
+from amberbox.blackbox.columns.arrays import numpy_type, objects
+from amberbox.blackbox.columns.diagnostic_values import (
+    has_values,
+    with_values,
+    with_values_schema,
 )
-from amberbox.blackbox.columns.ros_definition import SIZES, parse_definition
-from amberbox.blackbox.columns.ros_layout import (
-    FieldPlaces,
-    FixedPieces,
+from amberbox.blackbox.columns.layout_cache import (
     LayoutCache,
     LayoutGroup,
-    ScatteredPlaces,
     TooManyLayoutsError,
+    rows_in_portions,
+)
+from amberbox.blackbox.columns.own_stamp import stamp_column, with_stamps
+from amberbox.blackbox.columns.ros_definition import SIZES, parse_definition
+from amberbox.blackbox.columns.ros_layout import (
+    ByteLayout,
+    FieldPlaces,
+    FixedPieces,
+    ScatteredPlaces,
     compile_walker,
     is_big_endian,
+    layout_finder,
+    places_of,
     walk_all,
 )
 from amberbox.blackbox.columns.ros_wire import (
@@ -42,10 +47,9 @@ from amberbox.blackbox.columns.ros_wire import (
     flatten_definition,
     plan,
 )
+from amberbox.blackbox.columns.row_tables import join_in_order
 from amberbox.core.clock import NS
-from amberbox.core.errors import UsageError
-from amberbox.core.timestamps import stamp_of
-from amberbox.core.types import Column, ColumnData, IntArray, ItemSchema, Ragged, Rows, Schema
+from amberbox.core.types import Column, ColumnData, IntArray, Ragged, Rows, Schema
 
 _PAIRED = ("time", "duration")
 _DTYPES = {kind: numpy_type(kind) for kind in SIZES if kind not in _PAIRED}
@@ -141,64 +145,6 @@ class _Builder:
         return times
 
 
-def concat_rows(parts: Sequence[Rows]) -> Rows:
-    """Append tables with the same columns, in the order given."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    bases = np.cumsum([0] + [part.count for part in parts]).tolist()
-    return Rows(
-        bases[-1],
-        {name: concatenate([part.columns[name] for part in parts]) for name in first.columns},
-        {
-            path: concat_rows(
-                [
-                    replace(part.children[path], parent_row=_moved(part.children[path], base))
-                    for part, base in zip(parts, bases, strict=False)
-                ]
-            )
-            for path in first.children
-        },
-        _concat_ints([part.stamp_ns for part in parts]),
-        _concat_ints([part.parent_row for part in parts]),
-        _concat_ints([part.index for part in parts]),
-    )
-
-
-def _moved(child: Rows, base: int) -> IntArray | None:
-    return None if child.parent_row is None else child.parent_row + base
-
-
-def _concat_ints(parts: Sequence[IntArray | None]) -> IntArray | None:
-    arrays = [part for part in parts if part is not None]
-    return np.concatenate(arrays) if arrays else None
-
-
-def take_rows(rows: Rows, order: IntArray) -> Rows:
-    """Return rows by number; child rows follow their parents and keep their own order."""
-    return Rows(
-        len(order),
-        {name: take(column, order) for name, column in rows.columns.items()},
-        {path: _take_children(child, rows.count, order) for path, child in rows.children.items()},
-        None if rows.stamp_ns is None else rows.stamp_ns[order],
-    )
-
-
-def _take_children(child: Rows, parents: int, order: IntArray) -> Rows:
-    if child.parent_row is None or child.index is None:
-        raise ValueError("a child table without parents")
-    counts = np.bincount(child.parent_row, minlength=parents)[order]
-    starts = np.searchsorted(child.parent_row, order)
-    picked = ranges(starts, offsets_of(counts))
-    taken = take_rows(child, picked)
-    parent_row = np.repeat(np.arange(len(order), dtype=np.int64), counts)
-    return Rows(taken.count, taken.columns, taken.children, None, parent_row, child.index[picked])
-
-
-_LARGEST_JOIN = 16 << 20
-_STAMP_TYPES = frozenset(SIZES) - {"bool", "duration"} | {"string"}
-
-
 class RosUnroller:
     """Unrolls messages of one ROS type.
 
@@ -209,24 +155,21 @@ class RosUnroller:
         self, schema: Schema, cdr: bool, stamp: str | None = None, by_layout: bool = True
     ) -> None:
         table = flatten_definition(parse_definition(schema), schema.name, not cdr)
-        self._stamp = _stamp_column(table.schema, stamp)
+        self._stamp = stamp_column(table.schema, stamp)
         self.schema = replace(table.schema, stamp=self._stamp.path if self._stamp else "")
+        self._has_values = has_values(self.schema)
+        if self._has_values:
+            self.schema = with_values_schema(self.schema)
         self._plan = plan(table, cdr)
         self._walker = compile_walker(self._plan)
-        self._layouts = LayoutCache(self._plan) if by_layout else None
+        self._layouts = LayoutCache(layout_finder(self._plan)) if by_layout else None
         self._quick_stamp = _stamp_reader(self._plan, self._stamp)
 
     def rows(self, messages: Sequence[bytes]) -> Rows:
         """Unroll a batch of messages."""
-        parts: list[Rows] = []
-        bad: list[int] = []
-        for first, portion, lengths in _portions(messages):
-            rows, misfits = self._portion(portion, lengths)
-            parts.append(rows)
-            bad += [first + misfit for misfit in misfits]
-        if bad:
-            raise UnrollError(self.schema.type, bad, len(messages))
-        return self._with_stamps(concat_rows(parts))
+        unrolled = rows_in_portions(messages, self.schema.type, self._portion)
+        rows = with_stamps(unrolled, self._stamp)
+        return with_values(rows) if self._has_values else rows
 
     def stamp_ns(self, message: bytes) -> int | None:
         """Read the message's own stamp only; None without one, if it is 0, or if damaged."""
@@ -253,15 +196,6 @@ class RosUnroller:
             return None
         return found[0].item() if isinstance(found[0], np.generic) else found[0]
 
-    def _with_stamps(self, rows: Rows) -> Rows:
-        if self._stamp is None:
-            return rows
-        stamps = rows.columns[self._stamp.name]
-        assert not isinstance(stamps, Ragged), "a list holds no stamp"
-        if self._stamp.type != "time":
-            stamps = np.array([stamp_of(value) for value in stamps.tolist()], np.int64)
-        return replace(rows, stamp_ns=stamps)
-
     def _portion(self, messages: Sequence[bytes], lengths: list[int]) -> tuple[Rows, list[int]]:
         if self._layouts is not None and messages:
             try:
@@ -270,11 +204,13 @@ class RosUnroller:
                 self._layouts = None
         return self._one_by_one(messages)
 
-    def _by_layout(self, groups: Sequence[LayoutGroup], bad: list[int]) -> tuple[Rows, list[int]]:
+    def _by_layout(
+        self, groups: Sequence[LayoutGroup[ByteLayout]], bad: list[int]
+    ) -> tuple[Rows, list[int]]:
         if bad:
             return self._nothing(), bad
-        parts = [build_rows(self._plan, group.places(), len(group.members)) for group in groups]
-        return _in_order(parts, [group.members for group in groups]), []
+        parts = [build_rows(self._plan, places_of(group), len(group.members)) for group in groups]
+        return join_in_order(parts, [group.members for group in groups]), []
 
     def _one_by_one(self, messages: Sequence[bytes]) -> tuple[Rows, list[int]]:
         members, bad = self._by_byte_order(messages)
@@ -290,7 +226,9 @@ class RosUnroller:
                 )
         if bad:
             return self._nothing(), bad
-        return _in_order(parts, [np.array(numbers, np.int64) for numbers in members.values()]), []
+        return join_in_order(
+            parts, [np.array(numbers, np.int64) for numbers in members.values()]
+        ), []
 
     def _by_byte_order(self, messages: Sequence[bytes]) -> tuple[dict[bool, list[int]], list[int]]:
         members: dict[bool, list[int]] = {}
@@ -305,44 +243,6 @@ class RosUnroller:
     def _nothing(self) -> Rows:
         slots: list[list[int]] = [[] for _ in range(self._plan.slots)]
         return build_rows(self._plan, ScatteredPlaces(b"", slots, False), 0)
-
-
-def _portions(
-    messages: Sequence[bytes],
-) -> Iterator[tuple[int, Sequence[bytes], list[int]]]:
-    """Split a batch so that no join is larger than 16 MiB, or only by its last message."""
-    lengths = list(map(len, messages))
-    if sum(lengths) <= _LARGEST_JOIN:
-        yield 0, messages, lengths
-        return
-    first = size = 0
-    for end, length in enumerate(lengths, 1):
-        size += length
-        if size > _LARGEST_JOIN or end == len(lengths):
-            yield first, messages[first:end], lengths[first:end]
-            first, size = end, 0
-
-
-def _in_order(parts: Sequence[Rows], members: Sequence[IntArray]) -> Rows:
-    if len(parts) == 1:
-        return parts[0]
-    return take_rows(concat_rows(parts), np.argsort(np.concatenate(members)))
-
-
-def _stamp_column(schema: ItemSchema, stamp: str | None) -> Column | None:
-    """Find the column of the own stamp: the message's, or the one the configuration names."""
-    wanted = schema.stamp if stamp is None else stamp.strip("/").replace(".", "/")
-    if not wanted:
-        return None
-    candidates = [column for column in schema.columns if column.type in _STAMP_TYPES]
-    for column in candidates:
-        if column.path == wanted:
-            return column
-    times = [column.path for column in candidates if column.type == "time"]
-    raise UsageError(
-        f"{schema.type} has no time stamp {wanted!r}",
-        f"it has {', '.join(times)}" if times else "leave stamp empty: receipt time is used",
-    )
 
 
 def _stamp_reader(plan: WirePlan, stamp: Column | None) -> Callable[[bytes], int | None] | None:

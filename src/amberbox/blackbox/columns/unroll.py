@@ -39,9 +39,19 @@ def unroller(topic: Topic, stamp: str | None = None) -> Unroller:
             from amberbox.blackbox.columns.json_messages import DocumentUnroller
 
             return DocumentUnroller(topic.schema, topic.message_encoding, stamp)
+        encodings = topic.message_encoding, topic.schema.encoding
+        if encodings == ("protobuf", "protobuf"):
+            from amberbox.blackbox.columns.protobuf_messages import ProtobufUnroller
+
+            return ProtobufUnroller(topic.schema, stamp)
+        if encodings == ("frame", "amberbox_layout"):
+            from amberbox.blackbox.columns.frame_layout import FrameUnroller
+
+            return FrameUnroller(topic.schema, stamp)
         raise AmberboxError(
             f"{topic.name}: messages in {topic.message_encoding!r} cannot be unrolled",
-            "they are recorded as they come; ros1, cdr, json and msgpack have columns",
+            "they are recorded as they come; ros1, cdr, protobuf, json, msgpack and frames with a "
+            "layout have columns",
         )
     except (AmberboxError, MemoryError):
         raise

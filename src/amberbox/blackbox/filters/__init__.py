@@ -1,1 +1,1 @@
-"""Filters: decide before the journal whether a whole message is kept."""
+"""Filters: decide before the journal whether a message is kept; images are made smaller."""

@@ -7,7 +7,9 @@ from pathlib import Path
 from amberbox.blackbox.formats import (
     _mcap_storage,
     _sqlite_storage,
+    can_log,
     csv,
+    ethercat_capture,
     mongodump,
     ros1_bag,
     ros2_bag,
@@ -22,6 +24,7 @@ from amberbox.core.errors import AmberboxError
 
 _KNOWN = (
     "known are ROS 1 bags (.bag), folders of ROS 2 bags, .db3, MCAP, ULog and CSV files, "
+    "logs of CAN buses (candump, ASC, BLF, TRC), captures of EtherCAT (pcap, pcapng), "
     "and folders of mongodump"
 )
 _STORAGES = (_sqlite_storage.MAGIC, _mcap_storage.MAGIC, ros2_bag.ZSTD_MAGIC)
@@ -49,6 +52,11 @@ def open_recording(path: str | Path, options: ReadOptions = _NO_OPTIONS) -> Reco
         return ros2_bag.open_storage(path)
     if magic.startswith(ulog.MAGIC):
         return ulog.open_ulog(path, options)
+    if ethercat_capture.is_capture(magic):
+        return ethercat_capture.open_ethercat_capture(path, options)
+    can = can_log.kind_of(path, magic)
+    if can:
+        return can_log.open_can_log(path, can, options)
     if csv.is_csv(path, magic):
         return csv.open_csv(path, options)
     raise _unknown(path, magic)

@@ -179,12 +179,17 @@ class ReadOptions:
     """Options for recordings that do not contain everything.
 
     ``messages`` is a folder of ``.msg`` files, ``time`` the name of the time column of a table,
-    ``start_ns`` the begin of a recording whose times are relative.
+    ``start_ns`` the begin of a recording whose times are relative. ``dbc`` are files that describe
+    the messages of a CAN bus, ``eds`` its CANopen nodes as ``NODE=FILE``. ``ethercat`` is a file
+    such as ``black_box.yaml`` whose block ``ethercat`` describes the messages of EtherCAT segments.
     """
 
     messages: Path | None = None
     time: str | None = None
     start_ns: int | None = None
+    dbc: Sequence[Path] = ()
+    eds: Sequence[str] = ()
+    ethercat: Path | None = None
 
 
 _topic_index, _log_time = itemgetter(0), itemgetter(1)

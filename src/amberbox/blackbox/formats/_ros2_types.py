@@ -1,20 +1,15 @@
-"""Facts that ROS 2 bags lack: definitions of the ROS distributions, latched topics (QoS)."""
+"""What ROS 2 bags lack: definitions, taken from the ROS distributions, and latched topics (QoS)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import yaml
 
+from amberbox.blackbox.columns.ros2_types import DISTRIBUTIONS, definition_of, reads
 from amberbox.blackbox.formats._recording import RecordingReport, unpack_message
 from amberbox.core.types import Schema
-
-# ROS 2 distributions whose definitions are known, newest first
-DISTRIBUTIONS = (
-    "lyrical", "kilted", "jazzy", "iron", "humble", "galactic", "foxy", "eloquent", "dashing",
-)  # fmt: skip
 
 Sample = Callable[[], "bytes | None"]  # returns one message of the topic, to try a definition on
 
@@ -32,47 +27,32 @@ class Ros2Definitions:
         The distribution that the recording names comes first. Without one it is the newest whose
         definition reads a message of the topic to its last byte.
         """
-        candidates = [d for d in self._order() if type_name in _typestore(d).fielddefs]
+        known = (
+            (d, Schema(type_name, "ros2msg", definition_of(d, type_name))) for d in self._order()
+        )
+        candidates = [(d, schema) for d, schema in known if schema.data]
         if not candidates:
             self.report.add_note(
                 f"{type_name}: no definition in the recording and none known; bytes are kept"
             )
             return Schema(type_name, "", b"")
-        fitting = self._fitting(candidates, type_name, sample())
-        self.report.add_note(f"definitions not in the recording are those of ROS 2 {fitting}")
-        return Schema(type_name, "ros2msg", _definition(fitting, type_name))
+        distribution, schema = self._fitting(candidates, sample())
+        self.report.add_note(f"definitions not in the recording are those of ROS 2 {distribution}")
+        return schema
 
     def _order(self) -> list[str]:
         return sorted(DISTRIBUTIONS, key=lambda d: d != self.distribution)
 
-    def _fitting(self, candidates: list[str], type_name: str, data: bytes | None) -> str:
-        if data is None or candidates[0] == self.distribution:
+    def _fitting(
+        self, candidates: list[tuple[str, Schema]], data: bytes | None
+    ) -> tuple[str, Schema]:
+        if data is None or candidates[0][0] == self.distribution:
             return candidates[0]
         plain = unpack_message(data) or data
-        fitting = [d for d in candidates if _reads(d, type_name, plain)]
+        fitting = [c for c in candidates if reads(c[1], plain)]
         if not fitting:
-            self.report.add_note(f"{type_name}: its messages fit no known definition")
+            self.report.add_note(f"{candidates[0][1].name}: its messages fit no known definition")
         return (fitting or candidates)[0]
-
-
-@cache  # a typestore takes 0.1 s to build and never changes
-def _typestore(distribution: str) -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores(f"ros2_{distribution}"))
-
-
-def _definition(distribution: str, type_name: str) -> bytes:
-    text, _ = _typestore(distribution).generate_msgdef(type_name, ros_version=2)
-    return str(text).encode()
-
-
-def _reads(distribution: str, type_name: str, data: bytes) -> bool:
-    try:
-        _typestore(distribution).deserialize_cdr(data, type_name)
-    except Exception:  # rosbags raises whatever its generated code meets in bytes that do not fit
-        return False
-    return True
 
 
 _TRANSIENT_LOCAL = (1, "transient_local")  # as a number up to metadata version 8, then as a word

@@ -257,7 +257,9 @@ def _number(name: str, code: str, value: Any) -> bytes:
 
 
 def _as_number(code: str, value: Any) -> Any:
-    """Convert 3.0 to 3 where a whole number is needed."""
+    """Convert 3.0 to 3 where a whole number is needed, and decimals of MongoDB."""
+    if hasattr(value, "to_decimal"):
+        return int(value.to_decimal())
     whole = isinstance(value, float) and code not in "fd" and value.is_integer()
     return int(value) if whole else value
 

@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 import zstandard
 
+from amberbox.blackbox.columns.ros2_types import DISTRIBUTIONS
 from amberbox.blackbox.formats import _mcap_storage, _sqlite_storage
 from amberbox.blackbox.formats._recording import (
     RecordedMessage,
@@ -26,7 +27,7 @@ from amberbox.blackbox.formats._recording import (
     unpack_message,
     write_unpacked,
 )
-from amberbox.blackbox.formats._ros2_types import DISTRIBUTIONS, Ros2Definitions
+from amberbox.blackbox.formats._ros2_types import Ros2Definitions
 from amberbox.core.errors import AmberboxError
 
 METADATA = "metadata.yaml"

@@ -22,12 +22,14 @@ ALARM = "amberbox/alarm"
 SYMPTOM = "amberbox/symptom"
 DIAGNOSIS = "amberbox/diagnosis"
 COMMAND = "amberbox/command"
+EXPERIMENT = "amberbox/experiment"
 # how far the writer of a derived journal had read others when it wrote the records beside it
 CURSOR = "amberbox/cursor"
 
 _TEXT: dict[str, object] = {"type": "string"}
 _COUNT: dict[str, object] = {"type": "integer"}
 _NUMBER: dict[str, object] = {"type": "number"}
+_NUMBER_IF_ANY: dict[str, object] = {"type": ["number", "null"]}
 _COUNT_IF_ANY: dict[str, object] = {"type": ["integer", "null"]}
 
 
@@ -67,6 +69,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         ),
         "stalled_from_ns": _COUNT_IF_ANY,
         "stalled_to_ns": _COUNT_IF_ANY,
+        "complete_ns": _COUNT_IF_ANY,
     },
     EVENT: {"kind": _TEXT, "text": _TEXT, "source": _TEXT, "details": _TEXT},
     GAP: {
@@ -133,6 +136,9 @@ _FIELDS: dict[str, dict[str, object]] = {
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
         "also": _TEXTS,
+        "note": _TEXT,
+        "said_ns": _COUNT_IF_ANY,
+        "command": _TEXT,
     },
     SYMPTOM: {
         "id": _TEXT,
@@ -145,6 +151,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "evidence": _list_of(address=_TEXT, from_ns=_COUNT, to_ns=_COUNT),
         "blocked_by": _TEXTS,
         "reason": _TEXT,
+        "size": _NUMBER_IF_ANY,
     },
     DIAGNOSIS: {
         "id": _TEXT,
@@ -163,6 +170,7 @@ _FIELDS: dict[str, dict[str, object]] = {
             ambiguity=_TEXTS,
             proof=_TEXT,
             criticality=_NUMBER,
+            follows=_TEXTS,
         ),
         "groups": _list_of(members=_TEXTS, probability=_NUMBER, wider=_TEXTS, split_by=_TEXT),
         "mass_covered": _NUMBER,
@@ -177,10 +185,13 @@ _FIELDS: dict[str, dict[str, object]] = {
             risk=_NUMBER,
             gain_bits=_NUMBER,
             outcomes=_list_of(answer=_TEXT, probability=_NUMBER),
+            run=_TEXT,
+            moves={"type": "boolean"},
         ),
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
         "make_safe": _TEXTS,
+        "asked": _TEXTS,
     },
     COMMAND: {
         "robot": _TEXT,
@@ -195,6 +206,20 @@ _FIELDS: dict[str, dict[str, object]] = {
         "run": _TEXT,
         "step": _TEXT,
         "result": _TEXT,
+    },
+    EXPERIMENT: {
+        "run": _TEXT,
+        "experiment": _TEXT,
+        "sha256": _TEXT,
+        "robot": _TEXT,
+        "number": _COUNT,
+        "at_ns": _COUNT,
+        "kind": _TEXT,
+        "element": _TEXT,
+        "task": _TEXT,
+        "who": _TEXT,
+        "text": _TEXT,
+        "values": _TEXT,
     },
     CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }

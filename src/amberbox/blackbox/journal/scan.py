@@ -35,6 +35,7 @@ from amberbox.blackbox.journal.mcap import (
     is_finished,
     read_summary,
 )
+from amberbox.core.clock import NS
 from amberbox.core.types import IntArray
 
 _KNOWN = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
@@ -349,6 +350,15 @@ def start_record(path: Path) -> Mapping[str, str]:
     """Return the start record of a journal file; empty if it has none."""
     with path.open("rb") as file:
         return _start_record(file.read(1 << 16))
+
+
+_LATEST_NS = 3600 * NS
+
+
+def late_ns_of(start: Mapping[str, str]) -> int:
+    """Return how late the rows of a file may be by its start record, ns; at most an hour."""
+    text = start.get("late_ns", "0")
+    return min(int(text), _LATEST_NS) if text.isdecimal() else 0
 
 
 def _start_record(data: Buffer) -> Mapping[str, str]:

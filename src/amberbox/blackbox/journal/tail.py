@@ -37,6 +37,8 @@ class JournalHead:
 class HeadFile:
     """Overwrites the head in place: one line of fixed size with a CRC."""
 
+    _fd = -1
+
     def __init__(self, folder: Path) -> None:
         self._fd = os.open(folder / HEAD_NAME, os.O_WRONLY | os.O_CREAT, 0o644)
 
@@ -48,7 +50,12 @@ class HeadFile:
 
     def close(self) -> None:
         """Close the file; the last head stays."""
-        os.close(self._fd)
+        fd, self._fd = self._fd, -1
+        os.close(fd)
+
+    def __del__(self) -> None:
+        if self._fd >= 0:  # its writer was dropped without an end, as after an error
+            os.close(self._fd)
 
 
 def is_padded(folder: Path) -> bool:

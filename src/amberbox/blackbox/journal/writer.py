@@ -195,6 +195,15 @@ class _OpenFile:
     block: hashlib._Hash = field(default_factory=hashlib.sha256)
     block_start: int = 0
 
+    def released(self) -> int:
+        """Return the descriptor, which the caller closes from now on."""
+        fd, self.fd = self.fd, -1
+        return fd
+
+    def __del__(self) -> None:
+        if self.fd >= 0:  # its writer was dropped without an end, as after an error
+            os.close(self.fd)
+
 
 # schemas are repeated after as long as the file is old, but within these limits
 SCHEMA_REPEAT_NS = (NS, 10 * NS)
@@ -233,6 +242,7 @@ class JournalWriter:
         self.durable_seq = 0
         self.chain = chain
         self.bytes_written = 0
+        self.late_ns = 0  # how much before earlier rows a row may be; stated in each new file
         self._schemas: dict[Schema, int] = {}
         self._schema_list: list[Schema] = []
         self._channels: list[McapChannel] = []
@@ -278,7 +288,7 @@ class JournalWriter:
         publish_ns: Sequence[int] | IntArray,
         messages: Sequence[bytes],
     ) -> None:
-        """Write messages in their order as complete chunks.
+        """Write messages in their order, sorted by log time, as complete chunks.
 
         Raises OSError when they cannot be written: the file then ends where it ended before.
         """
@@ -391,7 +401,7 @@ class JournalWriter:
         with suppress(OSError):
             self._write_chain(file)
             self._append([file.summary.encode(file.size)])
-        self._closing.append(file.fd)
+        self._closing.append(file.released())
         self._file = None
 
     def close(self) -> None:
@@ -420,7 +430,7 @@ class JournalWriter:
             sync_folder(folder)
         except OSError:
             self._file = None
-            os.close(fd)
+            os.close(file.released())
             path.unlink()
             raise
         self._files += 1
@@ -435,6 +445,7 @@ class JournalWriter:
             "file": str(file.number),
             "first_seq": str(self.next_seq),
             "chain": self.chain,
+            **({"late_ns": str(self.late_ns)} if self.late_ns else {}),
         }
 
     def _profile(self) -> str:

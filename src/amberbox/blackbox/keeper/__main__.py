@@ -14,7 +14,7 @@ from pathlib import Path
 from amberbox.blackbox.retention.maintenance import LOCK_TIMEOUT_S, RetentionService, wait_for_lock
 from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
 from amberbox.blackbox.store.segment_file import can_build
-from amberbox.blackbox.store.store import open_to_write
+from amberbox.blackbox.store.store import REQUESTS, Store, open_to_write
 from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
@@ -44,20 +44,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # load slow modules (a second) before any segment is to be built
     if can_build():
         import pyarrow.parquet  # noqa: F401  # only to have it loaded
+    known = _times_of_change(store)
     keeper.step(stop)
-    while not options.once and _pause(stop, options.parent):
+    while not options.once and _pause(stop, options.parent, store, known):
+        known = _times_of_change(store)
         keeper.step(stop)
     keeper.close()
     lock.release()
     return 0
 
 
-def _pause(stop: threading.Event, parent: int) -> bool:
-    """Wait for the next step; False when it is time to go."""
+def _times_of_change(store: Store) -> tuple[int, ...]:
+    """Return when journal files and requests were last added or removed, in ns."""
+    folders = (store.folder("main"), store.folder("bulk"), store.path / REQUESTS)
+    return tuple(folder.stat().st_mtime_ns if folder.exists() else 0 for folder in folders)
+
+
+def _pause(stop: threading.Event, parent: int, store: Store, known: tuple[int, ...]) -> bool:
+    """Wait for the next step, or until files were added since; False when it is time to go."""
     end_s = time.monotonic() + PERIOD_S
     while time.monotonic() < end_s:
         if stop.wait(_PAUSE_S) or (parent and os.getppid() != parent):
             return False
+        if _times_of_change(store) != known:
+            return True
     return True
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from amberbox.blackbox.columns.flat_tables import FlatTable, TableSchema, flatten
 from amberbox.blackbox.columns.json_schema import viewer_schema
@@ -77,7 +77,7 @@ def _new_context() -> Context:
 
 @dataclass
 class Server:
-    """Sends messages to subscribed viewers. ``send`` belongs to one thread.
+    """Sends messages to subscribed viewers; ``send`` may be called from several threads.
 
     Channels advertised before ``start`` are available to the first viewer.
     """
@@ -85,6 +85,7 @@ class Server:
     listener: ViewerListener
     context: Context = field(default_factory=_new_context)
     _websocket: WebSocketServer | None = None
+    _advertising: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def websocket(self) -> WebSocketServer:
@@ -131,10 +132,11 @@ class Server:
 
     def advertise(self, topic: Topic) -> Channel:
         """Make a topic known to viewers."""
-        channel = self.listener.channels.get(topic)
-        if channel is None:
-            channel = self.listener.channels[topic] = self._channel(topic)
-        return channel
+        with self._advertising:
+            channel = self.listener.channels.get(topic)
+            if channel is None:
+                channel = self.listener.channels[topic] = self._channel(topic)
+            return channel
 
     def _channel(self, topic: Topic) -> Channel:
         from foxglove import Channel, Schema
@@ -176,6 +178,20 @@ class ViewerListener:
         """Do nothing: other viewers are not affected."""
 
 
+class Frames(Protocol):
+    """The messages of a range, in order of time."""
+
+    @property
+    def topics(self) -> Sequence[Topic]:
+        """All topics of the messages."""
+
+    def latched(self, at_ns: int) -> Sequence[ViewerMessage]:
+        """Return the last messages of latched topics before a moment."""
+
+    def read(self, from_ns: int) -> Iterator[ViewerMessage]:
+        """Yield the messages from a moment on."""
+
+
 @dataclass
 class MessageFrames:
     """The original messages of a window."""
@@ -202,9 +218,10 @@ class MessageFrames:
         found = self.current.ask(lambda known: latched_before(known, self.chosen, at_ns))
         return [ViewerMessage(stream.topic, at_ns, data) for stream, _, data in found]
 
-    def read(self, from_ns: int) -> Iterator[ViewerMessage]:
-        """Read on from a moment."""
-        for block, _ in self.chosen.read(self.current, (from_ns, self.window[1])):
+    def read(self, from_ns: int, to_ns: int | None = None) -> Iterator[ViewerMessage]:
+        """Read on from a moment, to the end of the window or to another one."""
+        window = (from_ns, self.window[1] if to_ns is None else to_ns)
+        for block, _ in self.chosen.read(self.current, window):
             topics = [stream.topic for stream in block.streams]
             times, places = block.received_ns.tolist(), block.stream.tolist()
             for place, at_ns, data in zip(places, times, block.data, strict=True):
@@ -251,7 +268,26 @@ class ColumnFrames:
                 yield ViewerMessage(topic, at_ns, message)
 
 
-Frames = MessageFrames | ColumnFrames
+@dataclass(frozen=True)
+class MergedFrames:
+    """The messages of several sources together."""
+
+    parts: Sequence[Frames]
+
+    @property
+    def topics(self) -> Sequence[Topic]:
+        """Return the topics of all."""
+        return [topic for part in self.parts for topic in part.topics]
+
+    def latched(self, at_ns: int) -> Sequence[ViewerMessage]:
+        """Return the last messages of latched topics before a moment."""
+        return [message for part in self.parts for message in part.latched(at_ns)]
+
+    def read(self, from_ns: int) -> Iterator[ViewerMessage]:
+        """Yield the messages from a moment on."""
+        return heapq.merge(
+            *(part.read(from_ns) for part in self.parts), key=attrgetter("received_ns")
+        )
 
 
 def span_of(catalogue: StoreCatalogue, window: Window) -> tuple[int, int]:
@@ -291,6 +327,7 @@ class Playback:
     span: tuple[int, int]
     speed: float = 1.0
     clock_ns: Callable[[], int] = time.monotonic_ns
+    loop: bool = False
     _changed: threading.Condition = field(default_factory=threading.Condition)
     _playing: bool = True
     _ended: bool = False
@@ -301,6 +338,10 @@ class Playback:
 
     def __post_init__(self) -> None:
         self._at_ns = self.span[0]
+
+    def pause(self) -> None:
+        """Do not play before a viewer asks for it."""
+        self._playing = False
 
     def control(self, request: PlaybackControlRequest) -> PlaybackState:
         """Carry out a viewer's request; called by the server's thread."""
@@ -337,7 +378,9 @@ class Playback:
                 server.send(frame)
             if self._play(server, start_ns, stop):
                 with self._changed:
-                    if self._seek_ns is None:
+                    if self._seek_ns is None and self.loop:
+                        self._seek_ns = self.span[0]
+                    elif self._seek_ns is None:
                         self._playing, self._ended, self._at_ns = False, True, self.span[1]
                     state = self._state("")
                 server.websocket.broadcast_time(self._at_ns)

@@ -29,6 +29,7 @@ from amberbox.blackbox.query.rows import (
     wanted_columns,
 )
 from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.query.transforms import Transform, find_transform
 from amberbox.blackbox.store.catalogue import (
     Answer,
     StoreCatalogue,
@@ -39,11 +40,13 @@ from amberbox.blackbox.store.clocks import ClockBook
 from amberbox.blackbox.store.incident import LogSpan, StoredIncident, incident_named
 from amberbox.blackbox.store.manifest import notes as damage_notes
 from amberbox.blackbox.store.segment_file import can_build
-from amberbox.blackbox.store.store import is_store, open_store, store_path
+from amberbox.blackbox.store.store import FOLDERS, is_store, open_store, store_path
 from amberbox.blackbox.store.table_reader import merge
 from amberbox.blackbox.store.tail import follow
 from amberbox.core.clock import NS
 from amberbox.core.names import identifier
+from amberbox.core.notes import KIND as NOTE_KIND
+from amberbox.core.notes import RecordedNote, in_range, newest_notes, note_of
 from amberbox.core.timestamps import ordered_span, parse_time
 from amberbox.core.types import Batch, Column, Gap, ItemSchema
 
@@ -138,9 +141,28 @@ class Record(Protocol):
     def sql(self, statement: str) -> Table:
         """Run a SELECT: each item and child table is a view (see ``blackbox.query.sql``)."""
 
+    def transform(self, target: str, source: str, at: Time = None) -> Transform:
+        """Return the transform of points in the frame ``source`` to points in ``target``.
+
+        ``at`` is a time of the stamps of transforms, None for the newest that is known. Raises
+        UsageError for unknown frames, frames that are not connected, and times without transforms.
+        """
+        return find_transform(self, target, source, self.time_ns(at))
+
     def events(self, from_: Time = None, to: Time = None) -> Table:
         """Return the events of the box: its event channel as a table."""
         return event_table(self, *self.span_ns(from_, to))
+
+    def annotations(self, from_: Time = None, to: Time = None) -> list[RecordedNote]:
+        """Return the notes of people that meet a range, in order of their times.
+
+        Those that are withdrawn are left out.
+        """
+        from_ns, to_ns = self.span_ns(from_, to)
+        events = self.events()
+        rows = events.rows() if "details" in events.names else ()
+        found = (note_of(row) for row in rows if row["kind"] == NOTE_KIND)
+        return in_range(newest_notes(n for n in found if n is not None).values(), from_ns, to_ns)
 
 
 def event_table(record: Record, from_: Time, to: Time) -> Table:
@@ -319,7 +341,10 @@ def follow_tables(
     if from_ns is not None and last_ns is not None:
         lookback_s = max((last_ns - from_ns) / NS, 0.0) + _NOW_S
     top = schema.parent or schema.item
-    for delivery in follow(record.path, {top}, lookback_s=lookback_s, live=live, stop=stop):
+    deliveries = follow(
+        record.path, {top}, lookback_s=lookback_s, live=live, stop=stop, writers=tuple(FOLDERS)
+    )
+    for delivery in deliveries:
         if isinstance(delivery, Batch):
             for rows in _rows(delivery, schema.item, from_ns):
                 yield make_table(schema, wanted, merge([rows], schema, needed, "received"))

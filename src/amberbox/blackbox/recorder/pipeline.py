@@ -31,6 +31,7 @@ from amberbox.blackbox.recorder.queue import (
     rate_limited,
     report_bad_stamp,
 )
+from amberbox.blackbox.recorder.watermark import LateSource, RecordWatermark
 from amberbox.blackbox.store.item_names import ItemNames
 from amberbox.blackbox.store.journal_reader import previous_chain
 from amberbox.blackbox.store.store import Store, WriterLock
@@ -76,12 +77,29 @@ class RunJournals:
         self._own_channels: dict[tuple[str, str], int] = {}
         self._repeats: dict[tuple[str, int], TopicStream] = {}
         self._latched: list[TopicStream] = []
+        self._late_ns = 0
+        # log time of each writer's newest row, and of the first of its present file
+        self._reached: dict[str, int] = {}
+        self._began: dict[str, int] = {}
+        self._due: dict[str, int] = {}  # since when a rotation is due
+        self._lags = False  # whether rows before the newest ones are still to come
         self.disk_error = ""  # text of the last write error; empty once a write has succeeded
 
     def use(self, writer: str) -> None:
         """Create the journal of a writer if there is none yet; from any thread."""
         if writer not in self._writers:
-            self._writers[writer] = self._make(writer)
+            made = self._make(writer)
+            made.late_ns = self._late_ns
+            self._writers[writer] = made
+
+    def expect_late(self, late_ns: int) -> bool:
+        """State in each new file how late rows may be; from any thread. True if it is news."""
+        if late_ns <= self._late_ns:
+            return False
+        self._late_ns = late_ns
+        for writer in list(self._writers.values()):
+            writer.late_ns = late_ns
+        return True
 
     def repeat(self, stream: TopicStream) -> None:
         """Repeat the last message of a latched stream in each file; from any thread."""
@@ -107,8 +125,12 @@ class RunJournals:
         row = (self._own_channel(writer, name), at_ns, at_ns, data)
         self._pending.setdefault(writer, []).append(row)
 
-    def flush(self, now_ns: int) -> bool:
-        """Write all pending rows; False on an error (they stay pending)."""
+    def flush(self, now_ns: int, watermark_ns: int | None = None) -> bool:
+        """Write all pending rows; False on an error (they stay pending).
+
+        Rows before ``now_ns`` may still come if the watermark is before it.
+        """
+        self._lags = watermark_ns is not None and now_ns - watermark_ns > LAG_NS
         errors = self._write_pending(now_ns)
         full = [name for name, error in errors.items() if error.errno in _FULL]
         made = [self._make_room(name) for name in full]
@@ -163,18 +185,35 @@ class RunJournals:
 
     def _write(self, name: str, rows: list[JournalRow], now_ns: int) -> None:
         writer = self._writers[name]
-        if writer.rotation_due(now_ns):
+        if self._rotates(name, writer, rows[0][1], now_ns):
             writer.rotate()
-        preamble = self._preamble(name, rows[0][1]) if writer.path is None else []
+        preamble: list[JournalRow] = []
+        if writer.path is None:  # the files of a writer follow each other in time
+            self._began[name] = max(rows[0][1], self._reached.get(name, 0))
+            preamble = self._preamble(name, self._began[name])
+        if rows[0][1] < self._began[name]:
+            rows[:] = [_not_before(self._began[name], row) for row in rows]
         rows[:0] = preamble
         before = writer.next_seq
         try:
             channels, log_ns, publish_ns, messages = zip(*rows, strict=True)
             writer.write(channels, log_ns, publish_ns, messages)
         finally:  # whole chunks written before an error are not written again
+            written = writer.next_seq - before
+            if written:
+                self._reached[name] = max(self._reached.get(name, 0), rows[written - 1][1])
             if writer.path is None:  # no file was made: the next attempt has its own preamble
                 del rows[: len(preamble)]
-            del rows[: writer.next_seq - before]
+            del rows[:written]
+
+    def _rotates(self, name: str, writer: JournalWriter, first_ns: int, now_ns: int) -> bool:
+        """Return whether a new file begins: it waits a while for rows that come late."""
+        if not writer.rotation_due(now_ns):
+            self._due.pop(name, None)
+            return False
+        since_ns = self._due.setdefault(name, now_ns)
+        is_late = self._lags or first_ns < self._reached.get(name, 0) - LAG_NS
+        return not is_late or now_ns - since_ns > self._late_ns
 
     def _preamble(self, writer: str, at_ns: int) -> list[JournalRow]:
         """Return the rows that each file begins with: run, clock, last latched messages."""
@@ -201,6 +240,8 @@ class RunJournals:
                 marks["stamp"] = item.options.stamp
             if topic.latched:
                 marks["latched"] = "1"
+            if stream.note:
+                marks["converted"] = stream.note
             writer = self._writers[item.writer]
             number = self._channels[key] = writer.channel(topic, marks)
             self._items[item.writer, number] = item
@@ -234,6 +275,11 @@ class RunJournals:
         for writer in list(self._writers.values()):
             writer.rotate()
 
+    def new_epoch(self) -> None:
+        """Begin new files, whose log time may be before that of the last ones."""
+        self.rotate()
+        self._reached.clear()
+
     def mark_sync(self) -> list[SyncMark]:
         """Return the marks whose ``wait`` makes everything written so far durable."""
         return [writer.mark_sync() for writer in list(self._writers.values())]
@@ -263,6 +309,14 @@ class RunJournals:
     def paths(self) -> list[Path]:
         """Files being written right now."""
         return [writer.path for writer in list(self._writers.values()) if writer.path]
+
+
+def _not_before(began_ns: int, row: JournalRow) -> JournalRow:
+    """Return a row moved to the start of its file, if it is before it."""
+    channel, log_ns, publish_ns, data = row
+    if log_ns >= began_ns:
+        return row
+    return channel, began_ns, began_ns if publish_ns == log_ns else publish_ns, data
 
 
 @dataclass
@@ -351,11 +405,13 @@ class StallMeter:
 _LIMIT_NS = round(BEAT_S * NS) + LATE_NS
 
 
+LAG_NS = NS // 5  # a new file waits for messages that come later than this
 CLOCK_PERIOD_NS = 10 * NS
 SPARING_CLOCK_PERIOD_NS = 60 * NS  # period of clock records while only events are recorded
 CLOCK_STEP_NS = 50_000_000
 EPOCH_STEP_NS = NS
 STALL_EVENT_NS = NS  # a stall of the recorder this long is an event
+RAISED_PAUSE_NS = 60 * NS
 # counters are written this often even without messages, so that replay's watermark advances
 HEARTBEAT_NS = NS
 
@@ -411,6 +467,8 @@ class Pipeline:
         self._rotates = False
         self._counted_ns = 0
         self._filter_error = ""
+        self.watermark = RecordWatermark()
+        self._is_first_of_epoch = False
         # the power state that a source reported last; None if none has
         self.power: Power | None = None
         # measures stalls of the recorder; None where messages bring their time
@@ -469,10 +527,17 @@ class Pipeline:
         self.own(channels.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded})
         self.queue.wake.set()
 
+    def late_source(self, late_ns: int) -> LateSource:
+        """Let the watermark wait for a source whose messages may be so late."""
+        if self._journals.expect_late(late_ns) and self.journal_paths:
+            self.rotate()
+        return self.watermark.add(late_ns)
+
     # -- one write interval
 
     def tick(self) -> None:
         """Write the messages queued since the last tick; after a write error they stay pending."""
+        self.watermark.look()
         taken = self.queue.take()
         if self._admission is not None:
             taken = self._admission.requeue_files(taken, self.bytes_written)
@@ -480,20 +545,25 @@ class Pipeline:
             self.clock.advance(max(map(itemgetter(2), taken)))
         now_ns = max(self.clock.now_ns(), self._last_tick_ns)
         self._watch_clock(now_ns)
-        kept = rate_limited(taken, self._last_tick_ns, now_ns)
+        kept = rate_limited(taken, self.watermark.at_ns, now_ns)
+        complete_ns = self.watermark.advance(now_ns)
+        if self._is_first_of_epoch:  # these had times of the epoch before
+            self._is_first_of_epoch = False
+            for item in list(self.items.values()):
+                item.raised = 0
         if self._admission is not None:
             kept = self._admission.admit(kept, now_ns)
-        self._sort_into_journals(self._filtered(kept), now_ns)
+        self._sort_into_journals(self._filtered(kept), now_ns, complete_ns)
         if self._rotates:
             self._rotates = False
             self._journals.rotate()
-        if self._journals.flush(now_ns):
+        if self._journals.flush(now_ns, complete_ns):
             self.queue.release()
             # after a large step of the wall clock begin a new epoch in new files
             step = abs(self.clock.offset_ns() - self._clock_offset_ns)
             if step > EPOCH_STEP_NS:
                 self._new_epoch(step)
-        self._journals.publish_heads(now_ns)
+        self._journals.publish_heads(complete_ns)
 
     def _filtered(self, messages: list[StreamMessage]) -> list[StreamMessage]:
         """Drop unchanged messages; if a filter fails, all are kept."""
@@ -531,9 +601,12 @@ class Pipeline:
 
     # -- into the journals
 
-    def _sort_into_journals(self, kept: Iterable[StreamMessage], now_ns: int) -> None:
+    def _sort_into_journals(
+        self, kept: Iterable[StreamMessage], now_ns: int, complete_ns: int
+    ) -> None:
         for stream, data, received_ns in kept:
             item = stream.item
+            item.written_ns = received_ns
             item.counters.kept += 1
             item.counters.bytes += len(data)
             if stream.topic.latched:
@@ -544,7 +617,8 @@ class Pipeline:
             for item in list(self.items.values()):
                 for reason, drops in self.queue.take_drops(item).items():
                     self.gaps.dropped(item.name, drops, reason)
-            self._count(now_ns)
+            self._count(now_ns, complete_ns)
+            self._tell_raised(now_ns)
         with self._own_lock:
             taken, self._own = self._own, []
         for name, data, at_ns in taken:
@@ -554,8 +628,11 @@ class Pipeline:
                 self._journals.add_own(writer, name, at_ns, data)
         self._last_tick_ns = now_ns
 
-    def _count(self, now_ns: int) -> None:
-        """Write the counters of items that changed, or none as a heartbeat."""
+    def _count(self, now_ns: int, complete_ns: int) -> None:
+        """Write the counters of items that changed, or none as a heartbeat.
+
+        They state up to when the record is complete, where messages may still come late.
+        """
         changed = []
         for item in list(self.items.values()):
             if item.counters != item.reported:
@@ -566,8 +643,21 @@ class Pipeline:
         if changed or silent or stalled:
             self._counted_ns = now_ns
             with self._own_lock:
-                encoded = msgspec.json.encode({"items": changed, **stalled})
+                late = {"complete_ns": complete_ns} if complete_ns < now_ns else {}
+                encoded = msgspec.json.encode({"items": changed, **stalled, **late})
                 self._own.append((channels.COUNTERS, encoded, now_ns))
+
+    def _tell_raised(self, now_ns: int, pause_ns: int = RAISED_PAUSE_NS) -> None:
+        """Emit an event about messages whose time of receipt was moved, once a minute at most."""
+        for item in list(self.items.values()):
+            if not item.raised:
+                continue
+            if item.raised_ns is not None and now_ns - item.raised_ns < pause_ns:
+                continue
+            count, item.raised, item.raised_ns = item.raised, 0, now_ns
+            many = f"{count} messages" if count > 1 else "a message"
+            text = f"{many} of {item.name} came too late to be recorded with their time of receipt"
+            self.event("late", text, item.source, item=item.name, count=count)
 
     def _stalled(self, now_ns: int) -> dict[str, int]:
         """Return the stall of the recorder since the last count; empty without one.
@@ -638,12 +728,16 @@ class Pipeline:
             self._own.append((channels.CLOCK, self._clock_record(at_ns, offset_ns), at_ns))
 
     def _new_epoch(self, step_ns: int) -> None:
-        self._journals.rotate()
+        self._journals.new_epoch()
         before_ns = self.clock.now_ns()
         self.clock.new_epoch()
         now_ns = self.clock.now_ns()
         self.gaps.shift(now_ns - before_ns)
         self.queue.shift_drops(list(self.items.values()), now_ns - before_ns)
+        self.watermark.begin(now_ns, now_ns - before_ns)
+        self._is_first_of_epoch = True
+        for item in list(self.items.values()):
+            item.written_ns = 0
         self._clock_offset_ns, self._clock_written_ns = 0, now_ns
         self._clock_seen_ns = 0
         self._last_tick_ns = self._counted_ns = now_ns
@@ -663,6 +757,7 @@ class Pipeline:
         Raises AmberboxError when the rows cannot be written.
         """
         self.gaps.close(self.clock.now_ns())
+        self.watermark.release()
         if self._admission is not None:
             self._admission.end()
         had_trouble = self.disk_error

@@ -24,6 +24,7 @@ from amberbox.blackbox.columns.unroll import unroller
 from amberbox.blackbox.columns.variables import select_columns
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
+from amberbox.blackbox.filters.transforms import TransformFilter
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import ItemSchema, Topic
@@ -89,6 +90,9 @@ class DataItem:
     versions: int = 0  # how many schemas have been inferred for its messages
     stamp_reported: bool = False  # whether an event about invalid stamps was emitted
     unused: tuple[str, ...] = ()  # names in the options that fit no variable, as reported last
+    written_ns: int = 0  # time of the newest message recorded; later ones are not before it
+    raised: int = 0  # messages later than their source may be, since the last event about them
+    raised_ns: int | None = None  # when that event was
 
     def __post_init__(self) -> None:
         if self.options.max_frequency:
@@ -96,9 +100,13 @@ class DataItem:
 
     def drop(self, received_ns: int, reason: str) -> None:
         """Count a dropped message."""
-        self.counters.dropped += 1
-        first, last, count = self.drops.get(reason, (received_ns, received_ns, 0))
-        self.drops[reason] = (min(first, received_ns), max(last, received_ns), count + 1)
+        self.drop_all((received_ns, received_ns, 1), reason)
+
+    def drop_all(self, drops: Drops, reason: str) -> None:
+        """Count dropped messages."""
+        self.counters.dropped += drops[2]
+        first, last, count = self.drops.get(reason, (drops[0], drops[1], 0))
+        self.drops[reason] = (min(first, drops[0]), max(last, drops[1]), count + drops[2])
 
     @property
     def writer(self) -> str:
@@ -116,6 +124,7 @@ class DataItem:
             "max_frequency": self.options.max_frequency,
             "keep": self.options.keep,
             "change": options["change"],
+            **{key: options[key] for key in ("image", "transforms") if options[key] is not None},
         }
 
 
@@ -133,6 +142,9 @@ class TopicStream:
     # whether names of inferred variables are transliterated from other scripts
     letters: bool = False
     change: ChangeFilter | None = None
+    transforms: TransformFilter | None = None
+    limited: bool = False  # whether the rate limit was applied before the queue
+    note: str = ""  # what was done to the messages before they were recorded
 
     @property
     def counters(self) -> ItemCounters:
@@ -158,6 +170,8 @@ class TopicStream:
             self.stamps = unroller(self.topic, options.stamp)
             if options.change is not None:
                 self.change = ChangeFilter(options.change, self.stamps.schema)
+            if options.transforms is not None:
+                self.transforms = TransformFilter(options.transforms, self.stamps.schema)
         except AmberboxError as error:
             return error.what
         return ""
@@ -203,17 +217,26 @@ QUIET_NS = 60_000_000_000  # schema changes within this time of each other are o
 StreamMessage: TypeAlias = tuple[TopicStream, bytes, int]
 
 
+RAISED_NS = 100_000_000  # a time of receipt that is moved by less is no loss of order
+
+
 def rate_limited(taken: Iterable[StreamMessage], floor_ns: int, now_ns: int) -> list[StreamMessage]:
-    """Return the messages that pass the rate limits, in order of time, none before ``floor_ns``."""
+    """Return the messages that pass the rate limits, in order of time, none before ``floor_ns``.
+
+    Those of an item are not before what was recorded of it earlier.
+    """
     kept: list[StreamMessage] = []
     for message in taken:
         stream, _, received_ns = message
         item = stream.item
         if item.options.keep == "none":
             continue
-        if not floor_ns <= received_ns <= now_ns:  # stamped before a tick or a new epoch
-            message = (stream, message[1], min(max(received_ns, floor_ns), now_ns))
-        if item.rate is not None and not item.rate.accept(message[2]):
+        least_ns = max(floor_ns, item.written_ns)
+        if not least_ns <= received_ns <= now_ns:  # stamped before the watermark or a new epoch
+            item.raised += least_ns - received_ns > RAISED_NS
+            message = (stream, message[1], min(max(received_ns, least_ns), now_ns))
+        rate = None if stream.limited else item.rate
+        if rate is not None and not rate.accept(message[2]):
             item.counters.rate_limited += 1
             continue
         kept.append(message)
@@ -225,18 +248,25 @@ def change_filtered(kept: list[StreamMessage], emit: EmitEvent) -> list[StreamMe
     """Infer schemas; return the messages without unchanged ones of items with a change filter."""
     places: dict[int, list[int]] = {}
     for place, (stream, _, _) in enumerate(kept):
-        if stream.infers or stream.item.options.change is not None:
+        options = stream.item.options
+        if stream.infers or options.change is not None or options.transforms is not None:
             places.setdefault(id(stream), []).append(place)
     unchanged: set[int] = set()
+    earlier: dict[int, list[StreamMessage]] = {}  # messages dropped before that are kept after all
     for found in places.values():
         stream = kept[found[0]][0]
         if stream.infers:
             _infer(stream, [kept[place][1] for place in found], kept[found[-1]][2], emit)
-        if stream.item.options.change is not None:
-            unchanged.update(_unchanged(stream, kept, found))
-    if not unchanged:
+        if stream.item.options.change is not None or stream.transforms is not None:
+            unchanged.update(_unchanged(stream, kept, found, earlier))
+    if not unchanged and not earlier:
         return kept
-    return [message for place, message in enumerate(kept) if place not in unchanged]
+    return [
+        message
+        for place, last in enumerate(kept)
+        if place not in unchanged
+        for message in (*earlier.get(place, ()), last)
+    ]
 
 
 def _infer(stream: TopicStream, messages: Sequence[bytes], now_ns: int, emit: EmitEvent) -> None:
@@ -303,19 +333,37 @@ def _note_malformed(stream: TopicStream, count: int, emit: EmitEvent) -> None:
     item.malformed += count
 
 
-def _unchanged(stream: TopicStream, kept: list[StreamMessage], places: list[int]) -> list[int]:
-    """Return the places of messages that the change filter drops; malformed ones stay."""
-    if stream.stamps is None or stream.change is None:
+def _unchanged(
+    stream: TopicStream,
+    kept: list[StreamMessage],
+    places: list[int],
+    earlier: dict[int, list[StreamMessage]],
+) -> list[int]:
+    """Return the places of messages that the change filter drops; malformed ones stay.
+
+    Messages of batches before that it keeps now are added to ``earlier``, by the next place.
+    """
+    if stream.stamps is None or (stream.change is None and stream.transforms is None):
         return []
+    messages = [kept[place][1] for place in places]
     try:
-        rows = stream.stamps.rows([kept[place][1] for place in places])
+        rows = stream.stamps.rows(messages)
     except UnrollError as error:
         bad = {places[row] for row in error.bad}
         rest = [place for place in places if place not in bad]
-        return _unchanged(stream, kept, rest) if rest else []
+        return _unchanged(stream, kept, rest, earlier) if rest else []
     times = np.fromiter((kept[place][2] for place in places), np.int64, len(places))
-    mask = stream.change.mask(rows, times)
-    dropped = [place for place, keep in zip(places, mask.tolist(), strict=True) if not keep]
+    if stream.transforms is not None:
+        chosen = stream.transforms.select(rows, times, messages)
+        for row, data in chosen.earlier:
+            place = places[row]
+            earlier.setdefault(place, []).append((stream, data, kept[place][2]))
+        mask = chosen.kept
+        stream.counters.unchanged -= len(chosen.earlier)
+    else:
+        assert stream.change is not None
+        mask = stream.change.mask(rows, times).tolist()
+    dropped = [place for place, keep in zip(places, mask, strict=True) if not keep]
     stream.counters.unchanged += len(dropped)
     return dropped
 
@@ -379,6 +427,22 @@ class MessageQueue:
         with self._room:
             for item, received_ns in messages:
                 item.drop(received_ns, reason)
+
+    def count_rate_limited(self, stream: TopicStream, received_ns: int) -> None:
+        """Count a message as received and dropped by the rate limit before it was put here."""
+        with self._room:
+            stream.counters.received += 1
+            stream.counters.last_received_ns = max(stream.counters.last_received_ns, received_ns)
+            stream.counters.rate_limited += 1
+
+    def count_dropped(
+        self, stream: TopicStream, from_ns: int, to_ns: int, count: int, reason: str = QUEUE_FULL
+    ) -> None:
+        """Count messages as received and dropped before they were put here."""
+        with self._room:
+            stream.counters.received += count
+            stream.counters.last_received_ns = max(stream.counters.last_received_ns, to_ns)
+            stream.item.drop_all((from_ns, to_ns, count), reason)
 
     def count_lost(self, item: DataItem, count: int) -> None:
         """Count messages that a source found missing between those received."""

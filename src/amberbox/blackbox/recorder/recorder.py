@@ -283,6 +283,48 @@ class RetentionProcess:
                 self._process.wait()
 
 
+ROTATE_KIND = "rotate"
+# Shortest time between two looks for requests, and between two rotations
+_REQUESTS_S, _ROTATIONS_S = 0.1, 1.0
+
+
+class RotationRequests:
+    """Begins new files when another process asks for it; looks for requests ten times a second.
+
+    A look at the folder's time of change is cheap: requests are read only when there are new ones.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._folder = pipeline.store.path / store.REQUESTS
+        self._due_s = 0.0
+        self._changed_ns = -1
+
+    def look(self) -> None:
+        """Carry out what is asked for, if it is time to look."""
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + _REQUESTS_S
+        try:
+            changed_ns = self._folder.stat().st_mtime_ns
+            if changed_ns == self._changed_ns:
+                return
+            # one that comes in the same tick of the file system's clock changes no time
+            is_settled = abs(time.time_ns() - changed_ns) > NS
+            self._changed_ns = changed_ns if is_settled else -1
+            asked = [one for one in store.pending(self._pipeline.store) if one.kind == ROTATE_KIND]
+            for request in asked:
+                store.finish(request)
+        except OSError:  # no folder yet, or a disk in trouble, which the writer reports
+            return
+        if asked:
+            who = asked[-1].values.get("who") or "somebody"
+            self._due_s = now_s + _ROTATIONS_S
+            self._pipeline.event("rotated", f"new files begin: asked for by {who}")
+            self._pipeline.rotate()
+
+
 _RECORDER_STOP_S = 3.0  # time limit for sources to end
 
 
@@ -347,6 +389,9 @@ class Recorder:
         for source in self._sources:
             source.prepare()
         self.pipeline.event("started", f"recording {self.folder.robot.id}")
+        for name in self.folder.not_built:
+            text = f"there is no source '{name}': its block of black_box.yaml is not recorded"
+            self.pipeline.event("source_missing", text, name)
         for source in self._sources:
             source.thread.start()
         options = self.folder.robot.store
@@ -369,12 +414,13 @@ class Recorder:
     def _tick_until_stopped(
         self, syncer: Syncer, power: PowerWatch, retention: RetentionProcess | None
     ) -> None:
-        write_s = self.folder.robot.store.write_s
+        write_s, rotation = self.folder.robot.store.write_s, RotationRequests(self.pipeline)
         due = time.monotonic() + write_s
         while not self.stop.is_set():
             self.pipeline.queue.wake.wait(max(0.0, due - time.monotonic()))
             self.pipeline.queue.wake.clear()
             due = time.monotonic() + write_s
+            rotation.look()
             self.pipeline.tick()
             if self.pipeline.bytes_written:
                 self._notifier.ready()

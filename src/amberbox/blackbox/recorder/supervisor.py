@@ -12,14 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.columns.json_schema import notes_of
+from amberbox.blackbox.filters.image import ImageFilter
+from amberbox.blackbox.recorder.image_converter import LATE_NS, ImageConverter
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.recorder.queue import TopicStream, report_unused_names
+from amberbox.blackbox.recorder.source_process import (
+    ProcessSink,
+    SourceProcess,
+    SourceProcessError,
+    needs_process,
+)
 from amberbox.blackbox.robot_folder.black_box_yaml import SourceBlock
 from amberbox.blackbox.robot_folder.folder import SOURCES
 from amberbox.blackbox.store import journal_reader
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
 from amberbox.core.files import replace_file
 from amberbox.core.plugins import get
-from amberbox.core.source import Power, TopicOptions
+from amberbox.core.source import MOST_LATE_S, Power, TopicOptions
+from amberbox.core.topic_selection import TopicSelection
 from amberbox.core.types import Topic
 
 INFERRED = ("json", "msgpack")
@@ -29,13 +40,22 @@ class BlockSink:
     """The sink of one configured block."""
 
     def __init__(
-        self, pipeline: Pipeline, name: str, topics: Sequence[TopicOptions], *, lossless: bool
+        self,
+        pipeline: Pipeline,
+        name: str,
+        topics: Sequence[TopicOptions],
+        *,
+        lossless: bool,
+        late_s: float = 0.0,
     ) -> None:
         self._pipeline = pipeline
+        self._late = pipeline.late_source(round(late_s * NS)) if late_s else None
         self._name = name
-        self._options = {options.name: options for options in topics}
+        self._selection = TopicSelection(topics)
         self._streams: list[TopicStream] = []
         self._numbers: dict[Topic, int] = {}
+        self._converters: dict[int, ImageConverter] = {}
+        self._items: dict[str, str] = {}
         self._links: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
         self._waits = lossless
@@ -43,11 +63,11 @@ class BlockSink:
         self.now_ns = pipeline.clock.now_ns
 
     def expect_topics(self) -> None:
-        """Create the item of each configured topic and open its gap until a publisher connects.
+        """Create the item of each topic listed by name; open its gap until a publisher connects.
 
         Files have no gaps of this kind.
         """
-        for options in self._options.values():
+        for options in self._selection.named.values():
             item = self._pipeline.item(self._name, options.name, options)
             if options.keep != "none" and not self._waits:
                 self._pipeline.gaps.expect(item.name)
@@ -55,28 +75,59 @@ class BlockSink:
     def topic(self, topic: Topic) -> int:
         with self._lock:
             if topic not in self._numbers:
-                self._streams.append(self._new_stream(topic))
-                self._numbers[topic] = len(self._streams) - 1
+                number = len(self._streams)
+                found = self._new_stream(topic)
+                converter = self._image_converter(found)
+                if converter is not None:
+                    self._converters[number] = converter
+                self._streams.append(found)
+                self._numbers[topic] = number
             return self._numbers[topic]
 
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
-        self._put(self._streams[stream], data, received_ns)
+        converter = self._converters.get(stream)
+        if converter is None:
+            self._put(self._streams[stream], data, received_ns)
+        else:
+            converter.put(data, received_ns)
+
+    def finish(self) -> None:
+        """Pass on everything that was received: the source has ended."""
+        for converter in list(self._converters.values()):
+            converter.finish()
 
     def longest_message(self) -> int:
         return self._pipeline.queue.longest_bytes
+
+    def complete(self, until_ns: int) -> None:
+        if self._late is not None:
+            self._late.complete_ns = until_ns
+
+    def end_run(self) -> None:
+        """Hold the watermark back no longer: the source does not run now."""
+        if self._late is not None:
+            self._late.complete_ns = None
+
+    def dropped(self, stream: int, from_ns: int, to_ns: int, count: int) -> None:
+        """Count messages for which the source's process had no room, as if the queue was full."""
+        self._pipeline.queue.count_dropped(self._streams[stream], from_ns, to_ns, count)
 
     def has_received(self) -> bool:
         """Return whether any message was received so far."""
         return any(stream.counters.received for stream in self._streams)
 
-    def lose_links(self, reason: str) -> None:
+    def lose_links(self, reason: str, since_ns: int | None = None) -> None:
         """Open the gaps of all peers after the source has failed."""
         for topic, peer in list(self._links):
-            self.link_down(topic, peer, reason)
+            self.link_down(topic, peer, reason, since_ns)
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        self.link_up_at(topic, peer, self.now_ns(), since_ns)
+
+    def link_up_at(self, topic: str, peer: str, at_ns: int, since_ns: int | None) -> None:
+        """Report as ``link_up`` that messages arrive since ``at_ns``."""
         self._links.add((topic, peer))
-        self._pipeline.gaps.up(self._item(topic), peer, self.now_ns(), since_ns)
+        self._pipeline.gaps.up(self._item(topic), peer, at_ns, since_ns)
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
         self._links.discard((topic, peer))
@@ -124,8 +175,11 @@ class BlockSink:
         return self._pipeline.store.path / "state" / f"{self._name}.json"
 
     def _item(self, topic: str) -> str:
-        options = self._options.get(topic) or TopicOptions(name=topic)
-        return self._pipeline.item(self._name, topic, options).name
+        """Return the name of a topic's item; its options are looked up once."""
+        if topic not in self._items:
+            options = self._selection.options(topic) or TopicOptions(name=topic)
+            self._items[topic] = self._pipeline.item(self._name, topic, options).name
+        return self._items[topic]
 
     def _new_stream(self, topic: Topic) -> TopicStream:
         item = self._pipeline.items[self._item(topic.name)]
@@ -144,7 +198,7 @@ class BlockSink:
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._report_type_change(known[-1].topic, topic, item.name)
-        if topic.latched and not stream.infers:
+        if topic.latched and not stream.infers and item.options.image is None:
             self._pipeline.latched(stream)
         wrong = "" if stream.infers else stream.compile()
         if wrong:
@@ -153,6 +207,29 @@ class BlockSink:
             )
         report_unused_names(stream, self._pipeline.event)
         return stream
+
+    def _image_converter(self, stream: TopicStream) -> ImageConverter | None:
+        """Return the converter of a stream whose images are to be converted, None for others."""
+        item = stream.item
+        if item.options.image is None or item.options.keep == "none":
+            return None
+        try:
+            images = ImageFilter(item.options.image, stream.topic)
+        except AmberboxError as error:
+            text = f"{item.name}: images are kept as they come: {error.what}; {error.hint}"
+            self.event("image_kept", text, item=item.name)
+            if stream.topic.latched:
+                self._pipeline.latched(stream)
+            return None
+        converted = TopicStream(item, images.topic, note=images.note)
+        converted.compile()
+        if images.topic.latched:
+            self._pipeline.latched(converted)
+        pipeline = self._pipeline
+        late_ns = LATE_NS + (self._late.late_ns if self._late else 0)
+        late = None if self._waits else pipeline.late_source(late_ns)
+        streams = stream, converted
+        return ImageConverter(images, streams, pipeline.queue, pipeline.event, late)
 
     def _report_type_change(self, old: Topic, new: Topic, item: str) -> None:
         if (old.message_encoding, old.schema) == (new.message_encoding, new.schema):
@@ -165,6 +242,21 @@ class BlockSink:
         self.event("type_changed", text, item=item, before=before, after=after)
 
 
+def run_source(source: Any, block: SourceBlock, sink: ProcessSink, stop: threading.Event) -> None:
+    """Run the source of a block as ``Source.run``, in its own process if its module asks for one.
+
+    Raises what the source raises, and SourceProcessError if its process dies.
+    """
+    module, node = get(SOURCES, block.plugin).load(), block.node
+    if node is None or not needs_process(module, block.config):
+        source.run(sink, stop)
+        return
+    folder = Path(block.file).parent
+    SourceProcess(module.__name__, block.plugin, block.name, node, folder).run(sink, stop)
+
+
+# how late the messages of a source's process may be, as it or the recorder is held up
+LATE_S = 5.0
 _FIRST_BACKOFF_S = 1.0
 _MAX_BACKOFF_S = 30.0
 
@@ -193,6 +285,13 @@ class SourceSupervisor:
             self._source = source
 
     def _run(self) -> None:
+        try:
+            self._run_until_stopped()
+        finally:
+            if self._sink is not None:
+                self._sink.finish()
+
+    def _run_until_stopped(self) -> None:
         backoff_s = _FIRST_BACKOFF_S
         while not self._stop.is_set():
             began = time.monotonic()
@@ -209,6 +308,9 @@ class SourceSupervisor:
                 return
             if time.monotonic() - began > _MAX_BACKOFF_S:
                 backoff_s = _FIRST_BACKOFF_S
+            if self._stop.is_set():
+                self._report_failure(error, "failed and has ended")
+                return
             self._report_failure(error, f"failed and starts again in {backoff_s:.0f} s")
             self._stop.wait(backoff_s)
             backoff_s = min(2 * backoff_s, _MAX_BACKOFF_S)
@@ -220,21 +322,31 @@ class SourceSupervisor:
                 source = self._module.Source(self._block.config, self._block.name)
             if self._sink is None:
                 self._sink = self._make_sink(source)
-            source.run(self._sink, self._stop)
+            run_source(source, self._block, self._sink, self._stop)
         except Exception as error:  # whatever it is: the other sources go on
             return error
+        finally:
+            if self._sink is not None:
+                self._sink.end_run()
         return None
 
     def _make_sink(self, source: Any) -> BlockSink:
         self._lossless = source.lossless
         name = self._block.name
-        sink = BlockSink(self._pipeline, name, source.topics(), lossless=source.lossless)
+        late_s = min(getattr(source, "late_s", 0.0), MOST_LATE_S)
+        if needs_process(self._module, self._block.config):
+            late_s = max(late_s, LATE_S)
+        sink = BlockSink(
+            self._pipeline, name, source.topics(), lossless=source.lossless, late_s=late_s
+        )
         sink.expect_topics()
         return sink
 
     def _report_failure(self, error: Exception, what: str) -> None:
         name = self._block.name
-        if self._sink is not None:
+        if self._sink is not None and isinstance(error, SourceProcessError):
+            self._sink.lose_links(error.what, error.since_ns)
+        elif self._sink is not None:
             self._sink.lose_links(f"{name} failed")
         text = f"{name} {what}: {error}"
         self._pipeline.event("source_failed", text, name, error=repr(error))

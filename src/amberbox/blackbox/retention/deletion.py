@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,13 +28,11 @@ from amberbox.blackbox.retention import usage
 from amberbox.blackbox.retention.rule import (
     DeletionUnit,
     JournalWindow,
-    Pin,
     Removal,
     ages_s,
     for_room,
     spared_columns,
     too_old,
-    unpinned,
 )
 from amberbox.blackbox.retention.usage import (
     DiskUse,
@@ -64,7 +62,7 @@ from amberbox.blackbox.store.journal_reader import (
 )
 from amberbox.blackbox.store.manifest import LARGE_BYTES, Manifest, SignHead, condense
 from amberbox.blackbox.store.manifest_entries import DeletionKind, Tombstone, to_record
-from amberbox.blackbox.store.store import FOLDERS, INCIDENTS, Store, is_locked
+from amberbox.blackbox.store.store import FOLDERS, INCIDENTS, KEPT, Store, is_locked
 from amberbox.blackbox.store.tail import RECORDED
 from amberbox.core.clock import SystemClock
 from amberbox.core.files import below
@@ -219,7 +217,6 @@ def _stepped_ns(clock: Sequence[tuple[int, int]]) -> int:
     return clock[-1][1] - clock[0][1] if clock else 0
 
 
-WRITER = "kept"
 # Clocks are in the copies' times, runs in the tombstone; counters go with what they count
 _LEFT_OUT = (channels.CLOCK, channels.COUNTERS, channels.RUN)
 _TIMES = ("from_ns", "to_ns")
@@ -263,7 +260,7 @@ class KeptJournal:
     def _present(self, records: list[OwnRecord]) -> set[OwnRecord]:
         first, last = records[0].received_ns, records[-1].received_ns
         found: set[OwnRecord] = set()
-        for journal in files_of(self._store, WRITER):
+        for journal in files_of(self._store, KEPT):
             if journal.rows and journal.start_ns <= last and journal.end_ns >= first:
                 found.update(own_records(journal))
         return found
@@ -272,10 +269,10 @@ class KeptJournal:
         if self._writer is None:
             store, boot = self._store, SystemClock().boot_id()
             options = JournalOptions(
-                store.folder(WRITER), store.id, WRITER, store.next_run(), boot, rotate_ns=1 << 62
+                store.folder(KEPT), store.id, KEPT, store.next_run(), boot, rotate_ns=1 << 62
             )
             self._streams.begin()
-            self._writer = JournalWriter(options, chain=previous_chain(store, WRITER))
+            self._writer = JournalWriter(options, chain=previous_chain(store, KEPT))
         writer = self._writer
         if writer.rotation_due(records[0].received_ns):
             writer.rotate()
@@ -382,6 +379,24 @@ def pinned_incidents(store: Store) -> list[StoredIncident]:
     return [incident for incident in load_all(store) if incident.is_pinned]
 
 
+def unpinned(store: Store, units: Iterable[DeletionUnit]) -> list[DeletionUnit]:
+    """Return the units that no incident holds; before deletion call it under the pin lock.
+
+    Times of receipt leave it open for a few seconds around a window: there the log times count,
+    which the journal states. What a budget of incidents does not count must not stay.
+    """
+    pins = pinned_incidents(store)
+    return [unit for unit in units if not _is_held(store, unit, pins)]
+
+
+def _is_held(store: Store, unit: DeletionUnit, pins: Sequence[StoredIncident]) -> bool:
+    likely = [pin for pin in pins if pin.holds_received(unit.run, unit.start_ns, unit.end_ns)]
+    found = extent(store.path / unit.name) if likely else None
+    if found is None:  # only its columns are left
+        return bool(likely)
+    return any(pin.holds(found.run, found.start_ns, found.end_ns) for pin in likely)
+
+
 def release_confirmed(store: Store) -> str | None:
     """Release the oldest incident that a server has confirmed; return its id, None if there is
     none.
@@ -405,16 +420,12 @@ def is_needed(store: Store, window: JournalWindow, path: Path) -> bool:
     return False
 
 
-Pins = Callable[[], Sequence[Pin]]
-
-
 @dataclass(frozen=True, slots=True)
 class Remover:
-    """Deletes units of a store; ``pins`` reads what must not be deleted."""
+    """Deletes units of a store."""
 
     store: Store
     kept: KeptJournal
-    pins: Pins
 
     def remove(
         self, removals: Sequence[Removal], places: Mapping[str, JournalWindow]
@@ -426,7 +437,7 @@ class Remover:
         Raises OSError when the tombstones cannot be written: then nothing is deleted.
         """
         with pin_lock(self.store):
-            free = {u.name for u in unpinned([r.unit for r in removals], self.pins())}
+            free = {u.name for u in unpinned(self.store, (r.unit for r in removals))}
             chosen = [r for r in removals if r.unit.name in free or self._stays_in_raw(r)]
             return self._remove(chosen, places) if chosen else []
 
@@ -519,7 +530,7 @@ class Deleter:
         self._journal = journal
         self._pending = pending
         self._kept = KeptJournal(store)
-        self._remover = Remover(store, self._kept, lambda: pinned_incidents(store))
+        self._remover = Remover(store, self._kept)
         self._full = FullMark(store)
         self._log = DeletionLog()
         self._checked_s = 0.0
@@ -610,7 +621,7 @@ class Deleter:
         return self._remove(chosen[:_BATCH], windows)
 
     def _free(self, units: Sequence[DeletionUnit]) -> list[DeletionUnit]:
-        return unpinned((u for u in units if u.name != self._busy), pinned_incidents(self._store))
+        return unpinned(self._store, (u for u in units if u.name != self._busy))
 
     def expire(self) -> None:
         """Delete the units that have outlived their lifetime."""

@@ -29,6 +29,8 @@ from amberbox.blackbox.retention.pins import (
     held_bytes,
     look_back,
     pin,
+    release,
+    window_in,
 )
 from amberbox.blackbox.retention.usage import pin_lock, with_reserve
 from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions, Trigger
@@ -125,6 +127,7 @@ def _event(trigger: str, count: int, why: str, text: str) -> ChannelValues:
 
 
 KIND = "incident"
+RELEASE_KIND = "incident_release"
 _HOLD_OFF_S = 60.0
 
 
@@ -145,6 +148,9 @@ class IncidentService:
         for request in store.pending(self._store):
             if request.kind == KIND:
                 self._grant(request)
+                store.finish(request)
+            elif request.kind == RELEASE_KIND:
+                self._release(str(request.values.get("key", "")))
                 store.finish(request)
         for incident in load_all(self._store):
             self._follow(incident)
@@ -188,13 +194,41 @@ class IncidentService:
             self._write(list(self._refusals.note(who, refused, reason)))
             return
         try:
+            if "key" in values:
+                span = int(values["from_ns"]), int(values["to_ns"])
+                self._mark(str(values["key"]), span, reason, who)
+                return
             before_s = float(values.get("before_s", 60.0))
             after_s = float(values.get("after_s", 20.0))
             trigger, at = str(values.get("trigger", "")), self._moment(request)
             self.fire(PinRequest(before_s, after_s, reason, who, trigger, at, request.path.stem))
-        except (TypeError, ValueError, OverflowError, UsageError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, UsageError) as error:
             text = f"an incident was asked for that cannot be made: {error}"
             self._write([event("incident_refused", text, reason=reason)])
+
+    def _mark(self, key: str, span: tuple[int, int], reason: str, who: str) -> None:
+        """Pin a window that was marked on the server; one with the same key is the same incident.
+
+        Raises UsageError if nothing of it is recorded.
+        """
+        found = window_in(self._store, *span)
+        if found is None:
+            raise UsageError("nothing of its window is in the record")
+        end, before_ns, after_ns = found
+        self.fire(PinRequest(before_ns / NS, after_ns / NS, reason, who, at=end, key=key))
+
+    def _release(self, key: str) -> None:
+        """Release what was marked with a key; a window that has other reasons stays pinned."""
+        incident = incident_of_firing(load_all(self._store), key)
+        if incident is None or not incident.is_pinned:
+            return
+        others = tuple(reason for reason in incident.reasons if reason.key != key)
+        if others:
+            with pin_lock(self._store):
+                kept = save(self._store, replace(incident, reasons=others, told=""))
+            self._register(kept)
+        else:
+            release(self._store, incident)
 
     def _moment(self, request: StoreRequest) -> LogMoment | None:
         """Find the moment of the record at which a request was made."""
@@ -270,6 +304,7 @@ _WATCHED = tuple(
     identifier(channel)
     for channel in (channels.STATUS, channels.ALARM, channels.SYMPTOM, channels.DIAGNOSIS)
 )
+_SELDOM = frozenset(_WATCHED[1:])  # not written as long as nothing is wrong
 _PROBE = "probe_"
 _TRANSITION = "component_state"  # kind of the watcher's events for a changed component
 
@@ -564,7 +599,7 @@ class Triggers:
     def _missing(self, watch: _Watch) -> Iterator[ChannelValues]:
         known = read_catalogue(self._store.path).schemas
         name = watch.trigger.name
-        for item in sorted(watch.missing - known.keys()):
+        for item in sorted(watch.missing - known.keys() - _SELDOM):
             text = f"the trigger {name} waits for {item}, which has not come"
             text += did_you_mean(item, known)
             yield event("trigger_waits", text, name, item=item)

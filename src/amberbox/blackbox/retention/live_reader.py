@@ -43,11 +43,14 @@ class RunTimeAxis:
             self.starts.append(log_ns)
             self.shifts.append(last_ns + self.shifts[-1] - log_ns)
 
-    def times(self, writer: str, log_ns: IntArray) -> IntArray:
-        """Return the times of a writer's rows; its log time goes back at a step only."""
+    def times(self, writer: str, log_ns: IntArray, late_ns: int = 0) -> IntArray:
+        """Return the times of a writer's rows.
+
+        Its log time goes back at a step only, or by ``late_ns`` where messages come late.
+        """
         first = int(log_ns[0])
         place, last = self._at.get(writer, (0, first))
-        if first < last - _MARGIN_NS:
+        if first < last - _MARGIN_NS - late_ns:
             place += 1
         while place + 1 < len(self.starts) and not self._fits(place, first):
             place += 1
@@ -165,19 +168,19 @@ class LiveReader:
                     part.reach(tail.last_ns)
                     yield part
                 part = self._part = RunSlice(delivery.run, RunTimeAxis())
-            self._take(part, delivery, tail.last_ns)
+            self._take(part, delivery, tail.last_ns, tail.late_ns)
         if part is not None:
             if not known or len(part.axis.starts) == known or tail.seq == _next_seq(head):
                 part.reach(_complete_ns(part, head, tail))
             yield part
 
-    def _take(self, part: RunSlice, batch: Batch, last_ns: int | None) -> None:
+    def _take(self, part: RunSlice, batch: Batch, last_ns: int | None, late_ns: int) -> None:
         first_ns = int(batch.log_time_ns[0])
         part.axis.begin(first_ns, last_ns if batch.item == _RUN else None)
         left = self._from.get("main")
         if left is not None and (batch.run, int(batch.seq[0])) < (left.run, left.seq):
             part.known = len(part.axis.starts)
-        times_ns = part.axis.times("main", batch.log_time_ns)
+        times_ns = part.axis.times("main", batch.log_time_ns, late_ns)
         if batch.item != _RUN:
             part.batches.append((batch, times_ns))
 
@@ -189,10 +192,10 @@ def _complete_ns(part: RunSlice, head: JournalHead | None, tail: WriterTail) -> 
     rows of other journals at the newest times may still come.
     """
     if head is None or head.run != part.run or head.next_seq > tail.seq:
-        return tail.last_ns
+        return tail.complete_ns
     if head.next_seq < tail.seq:
         return head.watermark_ns
-    return max(head.watermark_ns, tail.last_ns or 0)
+    return max(head.watermark_ns, tail.complete_ns or 0)
 
 
 def _next_seq(head: JournalHead | None) -> int | None:
@@ -208,4 +211,5 @@ def _sort_in(parts: list[RunSlice], writer: str, tail: WriterTail) -> None:
         part = parts[-1] if writer == WATCH else by_run.get(delivery.run)
         if part is not None:
             part.axis.begin(int(delivery.log_time_ns[0]), None)
-            part.batches.append((delivery, part.axis.times(writer, delivery.log_time_ns)))
+            times_ns = part.axis.times(writer, delivery.log_time_ns, tail.late_ns)
+            part.batches.append((delivery, times_ns))

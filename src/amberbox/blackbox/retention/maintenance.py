@@ -14,6 +14,7 @@ from contextlib import suppress
 from amberbox.blackbox.retention.deletion import Deleter, FreeSpaceThread
 from amberbox.blackbox.retention.incidents import IncidentMaintenance
 from amberbox.blackbox.retention.missions import MissionService
+from amberbox.blackbox.retention.notes import NoteService
 from amberbox.blackbox.retention.usage import DISK_FULL_ERRORS, with_reserve
 from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
 from amberbox.blackbox.signing.signatures import Signer
@@ -100,6 +101,7 @@ class RetentionService:
         self._deleter = Deleter(store, self._options, self.journal, self._is_pending)
         self._incidents = IncidentMaintenance(store, self._options, self.journal)
         self._missions = MissionService(store, self._options.missions, self.journal)
+        self._notes = NoteService(store, self.journal)
         self._recovered = False
         self._room: FreeSpaceThread | None = None
         self._situations = StoreChangeDetector(store)
@@ -115,6 +117,7 @@ class RetentionService:
         self._recover()
         self._incidents.step()  # windows pinned now are not deleted below
         self._missions.step()
+        self._notes.step()
         manifest.take_confirmations(self._store)  # deleted last below
         self._make_room()
         take_event_requests(self._store, self.journal)

@@ -660,13 +660,18 @@ def _request(
 
 def with_retention_lock(store: Store, work: Callable[[MissionService], object]) -> bool:
     """Run ``work`` under the maintenance lock; False if another process holds it."""
+    return with_maintenance_lock(store, lambda journal: work(MissionService(store, (), journal)))
+
+
+def with_maintenance_lock(store: Store, work: Callable[[DerivedJournal], object]) -> bool:
+    """Run ``work`` with the maintenance journal; False if another process holds its lock."""
     try:
         lock = WriterLock(store, "keeper")
     except UsageError:
         return False
     journal = DerivedJournal(store, "keep", chain=lambda: previous_chain(store, "keep"))
     try:
-        work(MissionService(store, (), journal))
+        work(journal)
     finally:
         journal.close()
         lock.release()

@@ -149,6 +149,33 @@ def _cut(piece: RunSection, oldest_age_ns: int, newest_age_ns: int) -> LogSpan:
     return LogSpan(piece.run, from_ns, to_ns, piece.offset_ns)
 
 
+def window_in(store: Store, from_ns: int, to_ns: int) -> tuple[LogMoment, int, int] | None:
+    """Return a window in times of receipt as moment, and how long before and after it (ns).
+
+    The moment is the end of the window, or that of the record, if the window ends later. None if
+    nothing of the window was recorded, or it begins after the end of the record.
+    """
+    newest = look_back(store, 0)
+    if newest is None or newest.end_received_ns < from_ns:
+        return None
+    back_ns = newest.end_received_ns - from_ns
+    timeline = look_back(store, back_ns) or newest
+    inside = [
+        piece
+        for piece in timeline.pieces
+        if piece.start_ns + piece.offset_ns < to_ns and piece.end_ns + piece.offset_ns >= from_ns
+    ]
+    if not inside:
+        return None
+    last, first = inside[0], inside[-1]
+    end = LogMoment(last.run, min(to_ns - last.offset_ns, last.end_ns))
+    start = LogMoment(first.run, max(from_ns - first.offset_ns, first.start_ns))
+    ages_ns = timeline.age_ns(start), timeline.age_ns(end)
+    before_ns = (ages_ns[0] or 0) - (ages_ns[1] or 0)
+    after_ns = max(to_ns - newest.end_received_ns, 0) if end == newest.end else 0
+    return end, max(before_ns, 0), after_ns
+
+
 def look_back(store: Store, back_ns: int, at: LogMoment | None = None) -> RecordTimeline | None:
     """Return the record's timeline from its end to ``back_ns`` before a moment; None if empty."""
     extents: list[Extent] = []
@@ -264,7 +291,7 @@ def _lasting_bytes(
 
     Columns count only if their journal is gone; otherwise they are duplicates, and can be deleted.
     """
-    journals = list(_journals(store, pinned, wide=True))
+    journals = list(_journals(store, pinned))
     raw = {f"{path.parent.name}/{path.name}" for path in journals}
     columns = [
         path
@@ -300,10 +327,8 @@ def _journals(
     store: Store,
     incidents: Sequence[StoredIncident],
     writers: Sequence[str] = _RAW,
-    *,
-    wide: bool = False,
 ) -> Iterator[Path]:
-    """Yield the journals of windows; ``wide``: all that are not deleted because of them."""
+    """Yield the journals of windows."""
     sealed = manifest.read(store.path).sealed if incidents else {}
     for writer in writers if incidents else ():
         for path in store.folder(writer).glob("*.mcap"):
@@ -313,19 +338,14 @@ def _journals(
                 incident.holds_received(entry.run, entry.start_ns, entry.end_ns)
                 for incident in incidents
             )
-            if may_be and ((wide and entry is not None) or _is_held(path, incidents, wide=wide)):
+            if may_be and _is_held(path, incidents):
                 yield path
 
 
-def _is_held(path: Path, incidents: Sequence[StoredIncident], *, wide: bool = False) -> bool:
+def _is_held(path: Path, incidents: Sequence[StoredIncident]) -> bool:
     found = extent(path) if incidents else None
-    if found is None:
-        return False
-    start_ns, end_ns = found.start_ns + found.offset_ns, found.end_ns + found.offset_ns
-    return any(
-        incident.holds(found.run, found.start_ns, found.end_ns)
-        or (wide and incident.holds_received(found.run, start_ns, end_ns))
-        for incident in incidents
+    return found is not None and any(
+        incident.holds(found.run, found.start_ns, found.end_ns) for incident in incidents
     )
 
 

@@ -8,10 +8,9 @@ incidents. Never pinned windows, and never events and statuses: their tables are
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Protocol
 
 from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
 from amberbox.blackbox.store.manifest_entries import DeletionKind
@@ -19,13 +18,6 @@ from amberbox.core.clock import NS
 
 ROOM = "for room"
 TOO_OLD = "older than its lifetime"
-
-
-class Pin(Protocol):
-    """A pinned section of the record: an incident."""
-
-    def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
-        """Return whether it meets rows of a run that were received in ``[from, to]``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +53,6 @@ class Removal:
         """Return about how many bytes become free; shared segments stay for a while."""
         raw = self.unit.raw_bytes if self.what != "columns" else 0
         return raw + (self.unit.column_bytes if self.what != "raw" else 0)
-
-
-def unpinned(units: Iterable[DeletionUnit], pins: Collection[Pin]) -> list[DeletionUnit]:
-    """Return the units that no pin holds."""
-    return [
-        unit
-        for unit in units
-        if not any(pin.holds_received(unit.run, unit.start_ns, unit.end_ns) for pin in pins)
-    ]
 
 
 def too_old(units: Iterable[DeletionUnit], options: RetentionOptions) -> list[Removal]:

@@ -6,6 +6,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -31,11 +32,16 @@ LEGACY_KEYS: Mapping[str, str] = {
 
 DEFAULTS = "default_parameters"
 NAMED = ("status",)  # sources whose blocks are always called by their ``name``, also a single one
-# planned sources: their blocks are noted and ignored instead of refused
-NOT_BUILT_YET = (
-    *("can", "dds", "ethercat", "event", "foxglove", "host", "journald", "mavlink", "modbus"),
-    *("mqtt", "opcua", "ros2", "serial", "video", "vda5050", "zenoh", "zyre"),
-)
+# ways to a robot that are no sources of their own
+INSTEAD: Mapping[str, str] = {
+    "dds": "- ros2: {via: dds}",
+    "foxglove": "- ros2: {via: bridge}",
+    "vda5050": "- mqtt: {vda5050: {}}",
+    "zenoh": "- ros2: {via: zenoh}",
+}
+# planned sources and such ways: earlier versions ignored their blocks, so folders that record have
+# them and go on without; elsewhere they are errors
+NOT_BUILT_YET = ("mavlink", "modbus", "opcua", "video", *INSTEAD)
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,8 @@ class SourceBlock:
     config: Any
     line: int
     file: str = ""
+    node: Node | None = None
+    """The block as it was read, to be read again in the process of its source."""
 
 
 @dataclass(frozen=True)
@@ -75,18 +83,23 @@ class _Block:
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of ``black_box.yaml``; ``not_built`` names those of planned sources."""
+    """The blocks of ``black_box.yaml``; ``not_built`` names those that are not recorded."""
 
     sources: tuple[SourceBlock, ...] = ()
     not_built: tuple[str, ...] = ()
 
 
-def read_blocks(root: Node, sources: str, problems: list[Problem]) -> Blocks:
-    """Check every block against its source's ``Config``; problems are appended to ``problems``."""
+def read_blocks(
+    root: Node, sources: str, problems: list[Problem], *, has_recorded: bool = False
+) -> Blocks:
+    """Check every block against its source's ``Config``; problems are appended to ``problems``.
+
+    Blocks of planned sources are errors, or notes in a folder that ``has_recorded`` without them.
+    """
     blocks = list(_split(root, problems))
     plugins = find(sources, defines=("Config", "Source"))
     defaults = _defaults(blocks, problems)
-    wanted = [block for block in blocks if _is_known(block, plugins, problems)]
+    wanted = [block for block in blocks if _is_known(block, plugins, problems, has_recorded)]
     names = _names(wanted, problems)
     built = [
         _build(block, name, plugins[block.plugin], defaults, problems)
@@ -135,12 +148,19 @@ def _defaults(blocks: Sequence[_Block], problems: list[Problem]) -> Node | None:
     return (found[0].node.mapping or {}).get("max_frequency") if built else None
 
 
-def _is_known(block: _Block, plugins: Mapping[str, Plugin], problems: list[Problem]) -> bool:
+def _is_known(
+    block: _Block, plugins: Mapping[str, Plugin], problems: list[Problem], has_recorded: bool
+) -> bool:
     if block.plugin == DEFAULTS or block.plugin in plugins:
         return block.plugin in plugins
     if _is_to_come(block, plugins):
-        what = f"source '{block.plugin}' is not built yet: block ignored"
-        problems.append(block.node.problem(block.plugin, what, is_error=False))
+        what = f"source '{block.plugin}' is not built yet"
+        hint = "take the block out, or put # before its lines; the others are recorded"
+        if block.plugin in INSTEAD:
+            what, hint = f"'{block.plugin}' is no source", f"write {INSTEAD[block.plugin]}"
+        if has_recorded:
+            what += ": the block is not recorded"
+        problems.append(block.node.problem(block.plugin, what, hint, is_error=not has_recorded))
         return False
     known = (*plugins, DEFAULTS, *NOT_BUILT_YET)
     what = f"there is no source '{block.plugin}'{did_you_mean(block.plugin, known)}"
@@ -182,24 +202,35 @@ def _build(
     if cls is None:
         return None
     node = _with_defaults(_without_name(block, name, cls, problems), defaults)
-    config = build(cls, node, problems, block.plugin, LEGACY_KEYS.get)
+    config = read_config(cls, node, block.plugin, Path(block.node.file).parent, problems)
     problems.extend(_repeated_topics(cls, node, block.plugin))
+    problems.extend(_unconverted_images(node, block.plugin))
     if config is None:
         return None
-    # File names of a source are relative to the folder of ``black_box.yaml``.
-    hook = getattr(config, "in_folder", None)
-    config = config if hook is None else hook(Path(block.node.file).parent)
     problems.extend(_notes(config, block))
-    return SourceBlock(block.plugin, name, config, block.node.line, block.node.file)
+    return SourceBlock(block.plugin, name, config, block.node.line, block.node.file, node)
+
+
+def read_config(
+    cls: type[Any], node: Node, plugin: str, folder: Path, problems: list[Problem]
+) -> Any:
+    """Build the configuration of a source; None if it has errors.
+
+    File names of a source are relative to ``folder``, that of ``black_box.yaml``.
+    """
+    config = build(cls, node, problems, plugin, LEGACY_KEYS.get)
+    hook = getattr(config, "in_folder", None)
+    return config if hook is None else hook(folder)
 
 
 def _notes(config: Any, block: _Block) -> Iterator[Problem]:
-    """Yield the notes of a source that are no errors, such as a file that may be missing yet."""
+    """Yield what is wrong with the files that a block names, and notes that are no errors."""
     keys = block.node.mapping or {}
     spellings = {field.name: field_keys(field) for field in dataclasses.fields(config)}
-    for name, what in getattr(config, "notes", tuple)():
-        key = next(key for key in spellings[name] if key in keys)
-        yield keys[key].problem(f"{block.plugin}.{key}", what, is_error=False)
+    for hook, is_error in (("wrong_files", True), ("notes", False)):
+        for name, what in getattr(config, hook, tuple)():
+            key = next(key for key in spellings[name] if key in keys)
+            yield keys[key].problem(f"{block.plugin}.{key}", what, is_error=is_error)
 
 
 def _config_class(block: _Block, plugin: Plugin, problems: list[Problem]) -> type[Any] | None:
@@ -241,15 +272,32 @@ def _with_frequency(entry: Node, max_frequency: Node) -> Node:
     return replace(entry, value={"max_frequency": max_frequency} | keys)
 
 
+def _topics(node: Node) -> Iterator[tuple[Node, Mapping[str, Node]]]:
+    """Yield each topic of a block, and its keys."""
+    for place in (node.mapping or {}).get("topics", node).items or ():
+        keys = place.mapping or {}
+        yield place, keys.get("topic", place).mapping or keys
+
+
+def _unconverted_images(node: Node, where: str) -> Iterator[Problem]:
+    """Yield a note for each topic whose images cannot be converted here."""
+    for _, keys in _topics(node):
+        if "image" in keys and find_spec("PIL") is None:
+            what = (
+                "images are kept as they come: the package pillow is not installed here: "
+                "pip install 'amberbox[images]'"
+            )
+            yield keys["image"].problem(f"{where}.topics.image", what, is_error=False)
+
+
 def _repeated_topics(cls: type[Any], node: Node, where: str) -> Iterator[Problem]:
     """Yield a problem for each topic that is given twice, also if its options are invalid."""
     kind = next(iter(get_args(get_type_hints(cls).get("topics"))), None)
     if not (isinstance(kind, type) and issubclass(kind, TopicOptions)):
         return
     seen: dict[str, int] = {}
-    for place in (node.mapping or {}).get("topics", node).items or ():
-        keys = place.mapping or {}
-        name = (keys.get("topic", place).mapping or keys).get("name")
+    for place, keys in _topics(node):
+        name = keys.get("name")
         if name is None or not name.text:
             continue
         if name.text in seen:

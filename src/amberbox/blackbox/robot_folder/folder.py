@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,12 +22,14 @@ from amberbox.blackbox.robot_folder.robot_yaml import (
     TriggerOptions,
     disclosures,
     key_notes,
+    mirror_notes,
     silence_of,
 )
 from amberbox.core.config import build, raise_errors
 from amberbox.core.errors import AmberboxError, Problem, UsageError
 from amberbox.core.names import derive_id, extend_names, item_name, readable_identifier
 from amberbox.core.plugins import get
+from amberbox.core.topic_selection import is_pattern
 from amberbox.core.yaml_nodes import load_yaml
 
 SOURCES = "amberbox.blackbox.sources"
@@ -39,7 +42,8 @@ class RobotFolder:
     """The checked configuration in a robot folder.
 
     ``config_hash`` is the SHA-256 over the folder's files; ``notes`` are findings that stop
-    nothing: legacy keys, blocks whose source is not built yet (named in ``not_built``).
+    nothing: legacy keys, blocks whose source is not built yet (named in ``not_built``) where the
+    folder has recorded without them.
     """
 
     path: Path
@@ -91,7 +95,8 @@ def inspect_folder(
     place = path if path.is_dir() else path.parent
     problems: list[Problem] = []
     robot = _read_robot(place, problems)
-    blocks = _read_black_box(place / BLACK_BOX_FILE if path.is_dir() else path, sources, problems)
+    black_box = place / BLACK_BOX_FILE if path.is_dir() else path
+    blocks = _read_black_box(black_box, sources, problems, _has_recorded(place, robot))
     problems.sort(key=lambda problem: (problem.file, problem.line))
     if robot is None or any(problem.is_error for problem in problems):
         return None, problems
@@ -136,30 +141,45 @@ def _read_robot(place: Path, problems: list[Problem]) -> RobotConfig | None:
     server = (node.mapping or {}).get("server") if node else None
     if robot is not None and robot.server is not None and server is not None:
         problems.extend(key_notes(server, place, robot.server))
+    mongodb = (node.mapping or {}).get("mongodb") if node else None
+    if robot is not None and robot.mongodb is not None and mongodb is not None:
+        problems.extend(mirror_notes(mongodb, robot.mongodb))
     return dataclasses.replace(robot, id=robot.id or derived) if robot else None
 
 
-def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks:
+def _has_recorded(place: Path, robot: RobotConfig | None) -> bool:
+    """Return whether the store has counted a run; the counter outlives all journals."""
+    store = None if robot is None else place / Path(robot.store.path).expanduser()
+    return store is not None and ((store / "run").is_file() or (store / "journal").is_dir())
+
+
+def _read_black_box(
+    path: Path, sources: str, problems: list[Problem], has_recorded: bool
+) -> Blocks:
     if not path.exists():
         hint = f"it says what to listen to; 'amberbox new' shows how a {BLACK_BOX_FILE} looks"
         problems.append(Problem(str(path), 1, "file", "is not there", hint))
         return Blocks()
     node = load_yaml(path, problems)
-    return read_blocks(node, sources, problems) if node else Blocks()
+    if node is None:
+        return Blocks()
+    return read_blocks(node, sources, problems, has_recorded=has_recorded)
 
 
 def _files(place: Path, robot: RobotConfig, blocks: Sequence[SourceBlock]) -> list[Path]:
     """Return the configuration files of a folder.
 
     Left out are the store, hidden files, compiled Python, the key to the server, the trust file
-    (``commands``), and files through which sources keep state or get orders while they run
-    (``state_files``).
+    (``commands``), the model of detectors, and files through which sources keep state or get orders
+    while they run (``state_files``).
     """
     store = (place / Path(robot.store.path).expanduser()).resolve()
     named = (name for block in blocks for name in getattr(block.config, "state_files", ()))
     left_out = {(place / KEY_FILE).resolve(), *(Path(name).resolve() for name in named)}
     if robot.commands:
         left_out.add((place / Path(robot.commands).expanduser()).resolve())
+    if robot.detection is not None:
+        left_out.add(robot.detection.file(place).resolve())
     found = ((path, path.resolve()) for path in _walk(place))
     return [p for p, at in found if at not in left_out and not at.is_relative_to(store)]
 
@@ -218,7 +238,10 @@ def _trigger(options: TriggerOptions) -> Trigger:
 
 @dataclass(frozen=True)
 class PlannedItem:
-    """A configured data item; ``type`` is empty if it is known only once it is received."""
+    """A configured data item; ``type`` is empty if it is known only once it is received.
+
+    Those of a pattern of topics are one, named by a pattern as well: ``ros_cam_*``.
+    """
 
     item: str
     source: str
@@ -243,6 +266,8 @@ def planned_items(
 
 def _named(item: PlannedItem, names: dict[str, str]) -> PlannedItem:
     """Return an item named as in a new store: a name in use gets a suffix."""
+    if is_pattern(item.topic):
+        return item
     key = f"{item.source} {item.topic.strip('/')}"
     if item.item.casefold() in {name.casefold() for name in names.values()}:
         names.update(extend_names(names, [key], lambda name: False, readable_identifier))
@@ -260,7 +285,7 @@ def _items(block: SourceBlock, problems: list[Problem], sources: str) -> Iterato
         return
     for topic in topics:
         yield PlannedItem(
-            item_name(block.name, topic.name),
+            _item_of(block.name, topic.name),
             block.name,
             topic.name,
             topic.type,
@@ -268,6 +293,14 @@ def _items(block: SourceBlock, problems: list[Problem], sources: str) -> Iterato
             topic.keep,
             tuple(topic.variable_names),
         )
+
+
+def _item_of(source: str, topic: str) -> str:
+    """Return the name of a topic's item, or a pattern that fits each item of a pattern's topics."""
+    if not is_pattern(topic):
+        return item_name(source, topic)
+    text = topic.strip("/").replace("**/", "*").replace("**", "*")
+    return f"{source}_{re.sub('[^A-Za-z0-9_*]', '_', text)}"
 
 
 def declared_folder(place: Path, robot: str, config_hash: str) -> tuple[RobotFolder, list[Problem]]:

@@ -6,21 +6,26 @@ begins and ends a mission; ``server:`` is the server that the robot reports to.
 
 from __future__ import annotations
 
+import json
+import re
 import stat
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import msgspec
 
+from amberbox.core.command import OrderLimit
 from amberbox.core.config import Finding, build, raise_errors
 from amberbox.core.errors import AmberboxError, Problem, UsageError, did_you_mean
 from amberbox.core.expression import Expression, parse
 from amberbox.core.expressions.tree import of_monitors
+from amberbox.core.mqtt import BrokerLogin, filter_problem, login_problems
 from amberbox.core.names import derive_id, is_id
 from amberbox.core.options import option
 from amberbox.core.units import parse_duration_s
@@ -28,6 +33,7 @@ from amberbox.core.yaml_nodes import Node, load_yaml
 
 GB = 1_000_000_000
 DAY_S = 86_400.0
+MOST_RULES = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,8 +223,8 @@ def trigger_problems(
     """Yield a problem for each item that a trigger names and the folder would not record.
 
     ``root`` is ``robot.yaml``, ``sources`` are the names of the blocks, ``items`` the configured
-    items. A source that names no topics records all. ``monitors`` are all outputs and statuses,
-    None if they are not known.
+    items and patterns of items. A source that names no topics records all. ``monitors`` are all
+    outputs and statuses, None if they are not known.
     """
     entries = ((root.mapping or {}).get("triggers") or root).items or ()
     for index, (node, trigger) in enumerate(zip(entries, triggers, strict=False)):
@@ -232,14 +238,15 @@ def trigger_problems(
                 when = (node.mapping or {}).get("when", node)
                 hint = "outputs are component/mode/output, statuses status(component/mode)"
                 yield when.problem(f"triggers[{index}].when", what, hint)
-    if any(trigger.when and trigger.items() for trigger in triggers):
+    foreign = (item for t in triggers if t.when for item in t.items())
+    if any(not item.startswith(OWN) for item in foreign):
         what = "names of variables are judged when they have been recorded"
         yield root.problem("triggers", what, is_error=False)
 
 
 def _unknown(item: str, sources: Sequence[str], items: Sequence[str]) -> str:
     top = item.partition("__")[0]
-    if top in items or item.startswith(OWN):
+    if item.startswith(OWN) or any(fnmatchcase(top, name) for name in items):
         return ""
     of = [source for source in sources if item.startswith(f"{source}_")]
     listed = [source for source in of if any(i.startswith(f"{source}_") for i in items)]
@@ -404,37 +411,129 @@ def key_notes(node: Node, folder: Path, options: ServerOptions) -> Iterator[Prob
         yield node.problem("server", what, is_error=False)
 
 
-Format = Literal["paper", "health_status", "diagnostics"]
+Format = Literal["paper", "health_status", "diagnostics", "mqtt"]
 
 _LOOPBACK = ("127.", "localhost", "[::1]")
+_ROS_URLS = ("ros", "ws", "wss")
+_MQTT_URLS = ("mqtt", "mqtts")
+_ROS_TOPIC = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)(/[A-Za-z0-9_]+)*")
 _DISCLOSES = "everybody who can reach it reads the robot's name, its components and their states"
 
 
 @dataclass(frozen=True)
 class PublishOptions:
-    """One address at which statuses are published (ZeroMQ, PUB)."""
+    """One address at which statuses are published: ZeroMQ, a ROS 1 master, a bridge, a broker."""
 
-    url: str = option(doc="where it listens for subscribers: tcp://127.0.0.1:5581, ipc://PATH")
-    format: Format = option("paper", "how the messages look")
-    every: float = option(0.5, "time from one round of messages to the next", unit="s")
-    topic: str = option("", "first frame of each message; without, they have one frame")
+    url: str = option(
+        doc="tcp://127.0.0.1:5581 or ipc://PATH, where it listens for subscribers; ros://HOST:11311"
+        " or ros:// for a ROS 1 master; ws://HOST:8765 for a Foxglove bridge; mqtt://HOST:1883 or"
+        " mqtts://HOST:8883 for an MQTT broker"
+    )
+    format: Format = option(
+        "paper", "how the messages look; ROS and bridges take diagnostics, brokers mqtt"
+    )
+    every: float | None = option(
+        None, "time between rounds of messages; 0.5 s, for ROS, bridges and brokers 1 s", unit="s"
+    )
+    topic: str = option(
+        "",
+        "first frame of each message (none if empty); in ROS, /diagnostics; of a broker what its"
+        " topics begin with, amberbox/ROBOT",
+    )
+    discovery: str = option(
+        "", "of a broker: Home Assistant's discovery prefix, homeassistant; no discovery if empty"
+    )
+    username: str = option("", "user at a broker")
+    password: str = option("", "password of that user", secret=True)
+    ca_file: str = option(
+        "", "certificate of the authority of mqtts://, PEM; the system's if empty"
+    )
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Yield each option with an invalid value, and why; opens nothing."""
         transport, separator, rest = self.url.partition("://")
         host, _, port = rest.rpartition(":")
-        if not separator or transport not in ("tcp", "ipc") or not rest:
+        if (
+            not separator
+            or transport not in ("tcp", "ipc", *_ROS_URLS, *_MQTT_URLS)
+            or not (rest or self.is_ros or self.is_mqtt)
+        ):
             yield "url", f"'{self.url}' is no address; write tcp://127.0.0.1:5581 or ipc://PATH"
         elif transport == "tcp" and not (host and port.isdecimal() and 0 < int(port) < 65536):
             yield "url", f"'{self.url}' has no port; write tcp://127.0.0.1:5581"
-        if not 0 < self.every < float("inf"):
+        elif transport in _ROS_URLS:
+            yield from self._unfit_for_ros(rest)
+        if self.is_mqtt or self.format == "mqtt":
+            yield from self._unfit_for_mqtt()
+        for key in ("discovery", "username", "password", "ca_file"):
+            if getattr(self, key) and not self.is_mqtt:
+                yield key, "is only for brokers: url: mqtt://HOST"
+        if self.every is not None and not 0 < self.every < float("inf"):
             yield "every", "must be above 0"
+
+    def _unfit_for_ros(self, rest: str) -> Iterator[tuple[str, str]]:
+        try:
+            parts = urlsplit(self.url)
+            is_address = bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            is_address = False
+        if rest and not is_address:
+            sample = "ros://robot:11311" if self.is_ros else "ws://robot:8765"
+            yield "url", f"'{self.url}' is no address; write {sample}"
+        if self.format != "diagnostics":
+            yield "format", f"ROS has no type for {self.format}; write format: diagnostics"
+        if not _ROS_TOPIC.fullmatch(self.ros_topic):
+            yield "topic", f"'{self.topic}' is not a name ROS allows for a topic"
+
+    def _unfit_for_mqtt(self) -> Iterator[tuple[str, str]]:
+        if self.format != "mqtt" or not self.is_mqtt:
+            yield "format", "brokers (url: mqtt://HOST) and format: mqtt go together"
+            return
+        login = BrokerLogin("", self.username, self.password, self.ca_file)
+        yield from login_problems(self.url, login, ("url", "ca_file", "ca_file", "ca_file"))
+        for key in ("topic", "discovery"):
+            text = getattr(self, key)
+            if text and (filter_problem(text) or "+" in text or "#" in text):
+                yield key, f"'{text}' is not what topics may begin with"
+
+    def in_folder(self, folder: Path) -> PublishOptions:
+        """Return the same with paths seen from the robot folder."""
+        if not self.ca_file:
+            return self
+        return replace(self, ca_file=str(folder / Path(self.ca_file).expanduser()))
+
+    @property
+    def is_mqtt(self) -> bool:
+        """Return whether it publishes at an MQTT broker."""
+        return self.url.startswith(("mqtt://", "mqtts://"))
+
+    @property
+    def is_ros(self) -> bool:
+        """Return whether it publishes as a ROS 1 node."""
+        return self.url.startswith("ros://")
+
+    @property
+    def is_bridge(self) -> bool:
+        """Return whether it publishes through a Foxglove bridge."""
+        return self.url.startswith(("ws://", "wss://"))
+
+    @property
+    def ros_topic(self) -> str:
+        """Return the topic in ROS."""
+        return self.topic or "/diagnostics"
+
+    @property
+    def interval_s(self) -> float:
+        """Return the time between rounds, seconds."""
+        return self.every or (1.0 if self.is_ros or self.is_bridge or self.is_mqtt else 0.5)
 
     @property
     def is_local(self) -> bool:
-        """Return whether only this computer can subscribe."""
+        """Return whether only this computer can subscribe; bridge and broker are one known peer."""
         transport, _, rest = self.url.partition("://")
-        return transport == "ipc" or rest.startswith(_LOOPBACK)
+        return (
+            transport in ("ipc", "ws", "wss", *_MQTT_URLS) or not rest or rest.startswith(_LOOPBACK)
+        )
 
 
 @dataclass(frozen=True)
@@ -469,6 +568,124 @@ def disclosures(root: Node, options: MonitoringOptions) -> Iterator[Problem]:
 
 def _below(node: Node, key: str) -> Node:
     return (node.mapping or {}).get(key, node)
+
+
+@dataclass(frozen=True)
+class RecoveryRule:
+    """A cause, and the action that is carried out against it without a person."""
+
+    when: str = option(doc="cause: a failure mode component#mode, or a component or component/mode")
+    do: str = option(doc="name of the action, of risk `state`")
+    at_most: OrderLimit = option(doc="how often, over restarts as well: 3 per 1 h")
+    parameters: Mapping[str, Any] = option({}, "its parameters by name", aliases=("with",))
+    wait: float = option(30.0, "how long the cause has to last before each attempt", unit="s")
+    condition: str = option("", "expression over variables that has to be true", aliases=("if",))
+
+    def check(self) -> Iterator[Finding]:
+        """Yield each option with an invalid value, and why."""
+        if not 0 <= self.wait <= DAY_S:
+            yield "wait", "must be from 0 to 1 d"
+        try:
+            json.dumps(dict(self.parameters), allow_nan=False)
+        except (TypeError, ValueError):
+            yield "parameters", "must be numbers, texts, true or false"
+        problem = self.condition and expression_problem(self.condition)
+        if problem:
+            yield "condition", problem.what, problem.hint
+
+    @property
+    def parameters_json(self) -> str:
+        """Return the parameters as the JSON text of an object."""
+        return json.dumps(dict(self.parameters))
+
+    @property
+    def key(self) -> str:
+        """Return under what its attempts are counted."""
+        return f"{self.when} {self.do}"
+
+
+_DATABASE = re.compile(r"[A-Za-z0-9_-]{1,63}")
+_ITEM_PATTERN = re.compile(r"[A-Za-z0-9_*]{1,255}")
+
+
+@dataclass(frozen=True)
+class MongodbOptions:
+    """A MongoDB to which items of the record are copied, as the paper's black box stored them."""
+
+    url: str = option(doc="address: mongodb://HOST:27017, further options behind ?")
+    database: str = option("logs", "database of the collections")
+    items: Sequence[str] = option((), "items to copy, or patterns: ros_*; all of sources if absent")
+    layout: Literal["nested", "flat"] = option(
+        "nested", "documents like the messages, or with one field per variable"
+    )
+    user: str = option("", "name to sign in with; without one, nobody signs in")
+    password: str = option("", "password of the user", secret=True)
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Yield each option with an invalid value, and why; opens nothing."""
+        yield from ((key, what) for key, what in self._wrong() if what)
+
+    def _wrong(self) -> Iterator[tuple[str, str]]:
+        yield "url", mongodb_url_problem(self.url)
+        if not _DATABASE.fullmatch(self.database):
+            yield "database", f"'{self.database}' is no name: letters, digits, _ and -, at most 63"
+        for name in self.items:
+            if not _ITEM_PATTERN.fullmatch(name):
+                yield "items", f"'{name}' is no item and no pattern; write ros_ropod_odom, or ros_*"
+        if self.password and not self.user:
+            yield "user", "is needed with a password"
+
+    @property
+    def host(self) -> str:
+        """Return the address without its options."""
+        return urlsplit(self.url).netloc
+
+    def chooses(self, item: str) -> bool:
+        """Return whether an item is copied."""
+        if not self.items:
+            return not item.startswith(OWN)
+        return any(fnmatchcase(item, name) for name in self.items)
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """Detectors that have learnt from nominal missions, and run beside the watcher."""
+
+    model: str = option(doc="model file of `amberbox learn`, relative to the folder")
+    from_server: bool = option(
+        False, "whether a command of the server that a person has signed may replace the file"
+    )
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Yield each option with an invalid value, and why; opens nothing."""
+        if not self.model or "\0" in self.model:
+            yield "model", "is no path"
+
+    def file(self, folder: Path) -> Path:
+        """Return the path of the model file of a robot folder."""
+        return folder / Path(self.model).expanduser()
+
+
+def mongodb_url_problem(url: str) -> str:
+    """Return what is wrong with the address of a MongoDB; empty if it is valid."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return "is no address; write mongodb://HOST:27017"
+    if parts.scheme not in ("mongodb", "mongodb+srv") or not parts.netloc:
+        return "must be mongodb://HOST:27017, or mongodb+srv://HOST"
+    if "@" in parts.netloc:
+        return "must not hold a login: write it under user and password"
+    return ""
+
+
+def mirror_notes(node: Node, options: MongodbOptions) -> Iterator[Problem]:
+    """Yield a note if copies leave this computer unencrypted; ``node`` is that of ``mongodb``."""
+    hosts = {host.rpartition(":")[0] or host for host in options.host.split(",")}
+    is_safe = re.search(r"[?&](tls|ssl)=true", options.url) or options.url.startswith("mongodb+srv")
+    if not is_safe and hosts - {*LOOPBACK, "[::1]"}:
+        what = f"copies go to {options.host} unencrypted; ?tls=true at the end of url encrypts them"
+        yield node.problem("mongodb.url", what, is_error=False)
 
 
 WhenFull = Literal["overwrite", "stop"]
@@ -573,10 +790,13 @@ class RobotConfig:
     store: StoreOptions = option(StoreOptions(), "where and how the record is kept")
     server: ServerOptions | None = option(None, "the fleet server this robot reports to")
     commands: str = option("", "file of who may order what from the server; nobody without")
+    recovery: Sequence[RecoveryRule] = option((), "what may be done without a person")
     triggers: Sequence[TriggerOptions] = option((), "what makes an incident")
     missions: Sequence[MissionOptions] = option((), "what begins and ends missions")
     incidents: IncidentOptions = option(IncidentOptions(), "limits of incidents")
     monitoring: MonitoringOptions = option(MonitoringOptions(), "what holds for all monitors")
+    mongodb: MongodbOptions | None = option(None, "a database that items are copied to")
+    detection: DetectionOptions | None = option(None, "detectors that run beside the watcher")
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Yield an invalid id, and names that are given twice."""
@@ -584,5 +804,10 @@ class RobotConfig:
             counts = Counter(entry.name for entry in getattr(self, key))
             for name in (name for name, count in counts.items() if count > 1):
                 yield key, f"there are several called '{name}'"
+        if len(self.recovery) > MOST_RULES:
+            yield "recovery", f"are more than {MOST_RULES} rules"
+        rules = Counter(rule.key for rule in self.recovery)
+        for twice in (key for key, count in rules.items() if count > 1):
+            yield "recovery", f"'{twice}' is there twice, and counts once"
         if self.id and not is_id(self.id):
             yield "id", f"'{self.id}' is no id (a-z 0-9 _ . -); '{derive_id(self.id)}' would be one"

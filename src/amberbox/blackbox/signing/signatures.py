@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 
 from amberbox.blackbox.journal.chunk import open_buffer
+from amberbox.blackbox.journal.mcap import is_finished
 from amberbox.blackbox.journal.tail import read_head
 from amberbox.blackbox.signing.findings import BAD
 from amberbox.blackbox.signing.journal_check import (
@@ -42,7 +43,8 @@ from amberbox.blackbox.store.store import Store, is_locked, run_and_number
 from amberbox.core.files import replace_file, sync_file
 
 HEADS = "heads.json"
-SIGNED_WRITERS = ("main", "bulk", "keep", "kept", "watch", "act")  # all writers but the ring
+# all writers but the ring
+SIGNED_WRITERS = ("main", "bulk", "keep", "kept", "watch", "act", "experiment", "detect")
 LOCKS = {"keep": "keeper", "kept": "keeper"}  # locks of the writers that are not called like these
 _LINE_BYTES = 1024  # more than a line with a signature has
 
@@ -244,13 +246,23 @@ def seal_journals(
 def finished_files(
     store: Store, sealed: Mapping[str, SealedJournal], *, own: bool = False
 ) -> Iterator[Path]:
-    """Yield the files that are to be sealed, oldest first; not those of the ring."""
+    """Yield the files that are to be sealed, oldest first; not those of the ring.
+
+    Of a running writer the newest one too, if it is finished and the next has not begun.
+    """
     for writer in SIGNED_WRITERS:
         paths = store.journal_files(writer)
         is_own = writer in LOCKS
-        if (is_own and not own) or (not is_own and is_locked(store, writer)):
+        is_running = not own if is_own else is_locked(store, writer)
+        if paths and is_running and (is_own or not _is_finished(paths[-1])):
             paths = paths[:-1]
         yield from (path for path in paths if f"{path.parent.name}/{path.name}" not in sealed)
+
+
+def _is_finished(path: Path) -> bool:
+    with suppress(FileNotFoundError), open_buffer(path) as data:
+        return is_finished(data)
+    return False
 
 
 def _seal(store: Store, path: Path, warn: Warn) -> SealedJournal | None:

@@ -15,6 +15,7 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
+from amberbox.core.topic_selection import TopicSelection, pattern_problem, wrong_types
 
 SAMPLE = """\
 - recording:
@@ -36,7 +37,12 @@ class RecordingOptions:
         aliases=("paths",),
     )
     speed: float | Literal["max"] = option(1.0, "times the original speed, or max for no waiting")
-    topics: Sequence[TopicOptions] = option((), "topics to replay; all when absent")
+    topics: Sequence[TopicOptions] = option(
+        (), "topics to replay, with * or ** those that match; all when absent"
+    )
+    exclude: Sequence[str] = option((), "names and patterns of topics to leave out")
+    types: Sequence[str] = option((), "types and patterns of types; others are left out")
+    exclude_types: Sequence[str] = option((), "types and patterns of types to leave out")
     loop: bool = option(False, "start again at the end")
     start_s: float = option(0.0, "leave out this much at the start of each recording", unit="s")
     duration_s: float | None = option(None, "play this much of each recording", unit="s")
@@ -61,6 +67,21 @@ class RecordingOptions:
             yield "start_s", "must not be negative"
         if self.duration_s is not None and self.duration_s <= 0:
             yield "duration_s", "must be above 0"
+        patterns = {"topics": [topic.name for topic in self.topics], "exclude": self.exclude}
+        for key, names in patterns.items():
+            yield from ((key, pattern_problem(name)) for name in names if pattern_problem(name))
+        for key in ("types", "exclude_types"):
+            yield from ((key, what) for what in wrong_types(getattr(self, key)))
+
+    def selection(self) -> TopicSelection:
+        """Return what chooses among the topics of a recording."""
+        return TopicSelection(
+            self.topics,
+            all_topics=not self.topics,
+            exclude=self.exclude,
+            types=self.types,
+            exclude_types=self.exclude_types,
+        )
 
     def notes(self) -> Iterator[tuple[str, str]]:
         """Yield paths without a recording so far; when it is to play, that is an error."""
@@ -102,11 +123,17 @@ class RecordingSource:
         self, path: Path, before: float, share: float, sink: Sink, stop: threading.Event
     ) -> None:
         with open_recording(path) as recording:
-            wanted = {topic.name for topic in self.config.topics}
+            selection = self.config.selection()
             names = {topic.name for topic in recording.topics}
-            for name in sorted(wanted - names):
+            missing = selection.named.keys() - names
+            missing |= {p.text for p, _ in selection.patterns if not any(map(p.fits, names))}
+            for name in sorted(missing):
                 sink.event("topic_missing", f"{path.name} has no topic {name}", topic=name)
-            chosen = [t if not wanted or t.name in wanted else None for t in recording.topics]
+            chosen = [
+                topic if selection.chooses(topic.name, topic.schema.name if topic.schema else "")
+                else None
+                for topic in recording.topics
+            ]  # fmt: skip
             for name in dict.fromkeys(topic.name for topic in chosen if topic is not None):
                 sink.link_up(name, path.name)
             streams = [None if topic is None else sink.topic(topic) for topic in chosen]

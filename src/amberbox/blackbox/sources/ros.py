@@ -8,15 +8,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from amberbox.blackbox.sources.ros1.client import RosSubscriber
+from amberbox.blackbox.sources.ros1.deadline import Deadline
 from amberbox.blackbox.sources.ros1.master import (
+    NodeSettings,
+    RosError,
+    RosMaster,
     SubscriberSettings,
+    SystemState,
     chosen_master,
     global_name,
+    host_and_port,
     is_global_name,
     master_uri,
 )
+from amberbox.blackbox.sources.ros1.service_client import probe_service
 from amberbox.core.options import option
+from amberbox.core.robot_graph import GraphService, GraphTopic, RobotGraph
 from amberbox.core.source import Sink, TopicOptions
+from amberbox.core.topic_selection import SelectionOptions
 
 SAMPLE = """\
 - ros:
@@ -27,17 +36,17 @@ SAMPLE = """\
           variable_names: [pose/pose/position/x, pose/pose/position/y]
           max_frequency: 10
       - topic: {name: /scan}
+      - topic: {name: /cam/**, max_frequency: 2}
+    exclude: [/cam/**/raw]
 """
 PASSIVE = "subscribes only, {config.seen_as}; no publisher, no service, no parameter is written"
 
 
 @dataclass(frozen=True)
-class RosOptions:
+class RosOptions(SelectionOptions):
     """The ``ros`` block."""
 
     ros_master_uri: str = option("", "the master; ROS_MASTER_URI, else localhost when absent")
-    topics: Sequence[TopicOptions] = option((), "topics to record, of any type")
-    all_topics: bool = option(False, "record every topic the master knows, /rosout excepted")
     invisible: bool = option(False, "find publishers by asking only, never register as a node")
     poll_s: float = option(1.0, "how often the master is asked who publishes", unit="s")
     hosts: Mapping[str, str] = option({}, "addresses of host names that do not resolve here")
@@ -56,8 +65,14 @@ class RosOptions:
             return "not registered at the master"
         return f"registered at the master as node {global_name(self.caller_id)}"
 
+    @staticmethod
+    def is_name(name: str) -> bool:
+        """Return whether ROS 1 allows a name."""
+        return is_global_name(name)
+
     def check(self) -> Iterator[tuple[str, str]]:
         """Yield each option with an invalid value, and why; opens nothing."""
+        yield from super().check()
         if self.ros_master_uri:
             try:
                 master_uri(self.ros_master_uri)
@@ -65,24 +80,12 @@ class RosOptions:
                 yield "ros_master_uri", f"{error}; write http://HOST:11311"
         if not is_global_name(global_name(self.caller_id)):
             yield "caller_id", f"'{self.caller_id}' is not a name ROS allows for a node"
-        yield from self._check_topics()
         if not 0.05 <= self.poll_s <= 3600:
             yield "poll_s", "must be between 0.05 and 3600 seconds"
         if self.max_message_mb is not None and not 0 < self.max_message_mb <= 4095:
             yield "max_message_mb", "must be above 0, and TCPROS allows 4095 at most"
         if not 4 <= self.dead_after_s <= 86400:
             yield "dead_after_s", "must be between 4 seconds and a day"
-
-    def _check_topics(self) -> Iterator[tuple[str, str]]:
-        if not self.topics and not self.all_topics:
-            yield "topics", "names no topic; list them, or write 'all_topics: true'"
-        seen: dict[str, str] = {}
-        for name in (topic.name for topic in self.topics):
-            whole = global_name(name)
-            if not is_global_name(whole):
-                yield "topics", f"'{name}' is not a name ROS allows for a topic"
-            elif seen.setdefault(whole, name) != name:
-                yield "topics", f"'{seen[whole]}' and '{name}' are the same topic"
 
 
 Config = RosOptions
@@ -98,13 +101,13 @@ class RosSource:
         self._name = name
 
     def topics(self) -> Sequence[TopicOptions]:
-        """Return the topics configured, with the leading slash that ROS gives them."""
-        return [replace(topic, name=global_name(topic.name)) for topic in self._config.topics]
+        """Return the topics and patterns configured, with the leading slash of ROS."""
+        return self._config.announced_topics()
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """Receive until ``stop`` is set; master and publishers may start, stop and restart."""
-        types = {topic.name: topic.type for topic in self.topics()}
-        RosSubscriber(settings(self._config, sink.longest_message()), types, sink).run(stop)
+        chosen = settings(self._config, sink.longest_message())
+        RosSubscriber(chosen, self._config.selection(), sink).run(stop)
 
 
 Source = RosSource
@@ -122,9 +125,94 @@ def settings(config: RosOptions, longest_message: int) -> SubscriberSettings:
         hosts=config.hosts,
         advertise=config.advertise,
         invisible=config.invisible,
-        all_topics=config.all_topics,
         poll_s=config.poll_s,
         tcp_nodelay=config.tcp_nodelay,
         message_limit=longest_message if limit_mb is None else round(limit_mb * 1_000_000),
         dead_after_s=config.dead_after_s,
     )
+
+
+def keys_of(address: str) -> dict[str, str]:
+    """Return the keys of a block for a master: the given one, or that of the environment.
+
+    Raises UsageError if it cannot be one.
+    """
+    return {"ros_master_uri": chosen_master(address, os.environ)}
+
+
+def service_of(config: RosOptions, node: str) -> tuple[str, str]:
+    """Return the kind and the input of a ``service`` that asks a node, or the master."""
+    host, port = host_and_port(chosen_master(config.ros_master_uri, os.environ))
+    place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return ("ros_node", f"{node}@{place}") if node else ("ros_master", place)
+
+
+def beside_recorder(config: RosOptions) -> RosOptions:
+    """Return the configuration of another node: a second one of the same name ends the first."""
+    return replace(config, caller_id=f"{global_name(config.caller_id)}_doctor")
+
+
+_CALL_S = 3.0  # for one call of the master
+_SERVICE_S = 1.0  # for one service to answer; then its node is not asked again
+
+
+def read_graph(config: RosOptions, wait_s: float) -> RobotGraph:
+    """Return what the master knows; nodes are asked for the types of their services in turn.
+
+    A service that does not answer within ``wait_s`` has no type; names that ROS does not allow are
+    left out. Registers nothing. Raises AmberboxError when the master does not answer.
+    """
+    deadline = Deadline.within(wait_s)
+    asked = replace(settings(config, 0), timeout_s=max(0.1, min(wait_s, _CALL_S)))
+    master = RosMaster(asked)
+    what = f"the ROS master {asked.master_uri} does not answer"
+    state, types = deadline.call(lambda: (master.graph(), master.topic_types()), what)
+    master.close()
+    state = SystemState(*map(_valid, (state.publishers, state.subscribers, state.services)))
+    pairs = (*state.publishers.values(), *state.subscribers.values(), *state.services.values())
+    return RobotGraph(
+        nodes=tuple(sorted({node for nodes in pairs for node in nodes})),
+        topics=tuple(_topics_of(state, types)),
+        services=tuple(_services_of(state, asked, deadline)),
+    )
+
+
+def _valid(nodes_by_name: Mapping[str, Sequence[str]]) -> Mapping[str, Sequence[str]]:
+    """Return the names and nodes that ROS allows; others come from no ROS node."""
+    return {
+        name: list(filter(is_global_name, nodes))
+        for name, nodes in nodes_by_name.items()
+        if is_global_name(name)
+    }
+
+
+def _topics_of(state: SystemState, types: Mapping[str, str]) -> Iterator[GraphTopic]:
+    for name in sorted(state.publishers.keys() | state.subscribers.keys()):
+        yield GraphTopic(
+            name,
+            _full_type(types.get(name, ""), "msg"),
+            tuple(sorted(state.publishers.get(name, ()))),
+            tuple(sorted(state.subscribers.get(name, ()))),
+        )
+
+
+def _services_of(
+    state: SystemState, asked: NodeSettings, deadline: Deadline
+) -> Iterator[GraphService]:
+    silent: set[str] = set()
+    for name, nodes in sorted(state.services.items()):
+        node, found = next(iter(nodes), ""), ""
+        if node not in silent:
+            try:
+                found = probe_service(
+                    name, asked, Deadline.within(min(_SERVICE_S, deadline.left_s()))
+                ).type
+            except RosError:
+                silent.add(node)
+        yield GraphService(name, _full_type(found, "srv"), node)
+
+
+def _full_type(name: str, kind: str) -> str:
+    """Return ``nav_msgs/msg/Odometry`` for the type ``nav_msgs/Odometry``; empty if unknown."""
+    package, _, own = name.partition("/")
+    return f"{package}/{kind}/{own}" if own else ""

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.timestamps import parse_time
 from amberbox.core.types import Topic
 from amberbox.sim.command_socket import CommandSocket
+from amberbox.sim.disturbances import Disturbance, Disturber, address_problems
 from amberbox.sim.faults import catalogue
 from amberbox.sim.live import apply_order
 from amberbox.sim.missions import SCENARIOS
@@ -86,6 +87,7 @@ class SimOptions:
     )
     duration_s: float | None = option(None, "end after this much robot time", unit="s")
     faults: Sequence[FaultOptions] = option((), "faults to inject")
+    disturbances: Sequence[Disturbance] = option((), "what happens to messages on their way")
     orders: str = option("", "file whose new lines are obeyed: fault ID [magnitude], or heal ID")
     commands: str = option(
         "", "ZeroMQ address where the robot takes requests to move; off if empty"
@@ -121,6 +123,7 @@ class SimOptions:
             yield "duration_s", "must be above 0"
         if self.commands and not self.commands.startswith(("tcp://", "ipc://")):
             yield "commands", "must be an address to bind, such as tcp://127.0.0.1:5557"
+        yield from self._wrong_disturbances()
         for topic in self.topics:
             if topic.name not in TOPIC_BY_NAME:
                 near = did_you_mean(topic.name, TOPIC_BY_NAME)
@@ -130,6 +133,11 @@ class SimOptions:
         except UsageError as error:
             yield "start", error.what
 
+    def _wrong_disturbances(self) -> Iterator[tuple[str, str]]:
+        for number, disturbance in enumerate(self.disturbances):
+            for key, what in address_problems(disturbance):
+                yield "disturbances", f"{key} of number {number + 1}: {what}"
+
 
 Config = SimOptions
 
@@ -137,6 +145,11 @@ Config = SimOptions
 def known_topics(config: SimOptions) -> Sequence[Topic]:
     """Return the topics that will be announced, which are known without running the robot."""
     return [spec.topic() for spec in _chosen(config)]
+
+
+def beside_recorder(config: SimOptions) -> SimOptions:
+    """Return a simulation of its own that takes no requests to move."""
+    return replace(config, commands="")
 
 
 class SimSource:
@@ -183,7 +196,9 @@ class SimSource:
         pace = None if speed == "max" else RealTimePacer(speed, robot.start_ns, stop)
         encode = msgspec.json.Encoder().encode
         orders = OrdersFile(Path(self.config.orders)) if self.config.orders else None
-        for topic, sent_ns, message in robot.step_until(float("inf") if end_s is None else end_s):
+        disturber = Disturber(self.config.disturbances, robot.start_ns, self.config.seed)
+        said = robot.step_until(float("inf") if end_s is None else end_s)
+        for topic, sent_ns, message in disturber.feed(said):
             if pace is not None:
                 pace.wait(sent_ns)
             if stop.is_set():

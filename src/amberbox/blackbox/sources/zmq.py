@@ -5,85 +5,16 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Any
 
-import msgspec
-
-from amberbox.core.clock import NS
+from amberbox.blackbox.payloads.payload import Continuity, detect_encoding
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
-from amberbox.core.timestamps import stamp_of
+from amberbox.core.topic_selection import TopicSelection, pattern_problem
 from amberbox.core.types import Topic
-
-_MISFITS = (msgspec.MsgspecError, AttributeError, RecursionError, TypeError, ValueError)
-
-Read = Callable[[bytes], "int | None"]
-
-
-@dataclass
-class Continuity:
-    """Counts missing messages of one publisher on one topic.
-
-    ``sequence`` is the path of a number that goes up by one per message; else ``stamp`` is the path
-    of a time stamp, and ``rate_hz`` is their rate. A number or stamp that goes back restarts the
-    count: the publisher has started again.
-    """
-
-    sequence: str
-    stamp: str
-    rate_hz: float
-    last_received_ns: int = 0
-    _last: int | None = None
-    _readers: dict[str, Read] = field(default_factory=dict)
-
-    @property
-    def path(self) -> str:
-        """Return the path that is read in each message."""
-        return self.sequence or self.stamp
-
-    def missing(self, payload: bytes, encoding: str) -> int | None:
-        """Return how many messages are missing before this one; None if unknown."""
-        if encoding not in self._readers:
-            meaning = _whole if self.sequence else stamp_of
-            self._readers[encoding] = _reader(self.path, encoding, meaning)
-        value = self._readers[encoding](payload)
-        if value is None:
-            return None
-        last, self._last = self._last, value
-        if last is None or value <= last:
-            return 0
-        steps = value - last if self.sequence else round((value - last) * self.rate_hz / NS)
-        return max(0, steps - 1)
-
-
-def _whole(value: Any) -> int | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    return int(value) if value == int(value) else None
-
-
-def _reader(path: str, encoding: str, meaning: Callable[[Any], int | None]) -> Read:
-    """Return a function that decodes only the value at a path."""
-    target: Any = Any
-    parts = path.strip("/").replace(".", "/").split("/")
-    for part in reversed(parts):
-        target = msgspec.defstruct("Place", [("value", target)], rename={"value": part})
-    module: Any = msgspec.json if encoding == "json" else msgspec.msgpack
-    decode, get = module.Decoder(target).decode, attrgetter(".".join(["value"] * len(parts)))
-
-    def read(payload: bytes) -> int | None:
-        try:
-            found = meaning(get(decode(payload)))
-        except (*_MISFITS, OverflowError):
-            return None
-        return None if found is None or (meaning is stamp_of and not found) else found
-
-    return read
-
 
 SAMPLE = """\
 - zmq:
@@ -104,13 +35,16 @@ _GIVEN_UP_S = (0.5, 30.0)
 _POLL_MS = 100
 _AT_ONCE = 500  # messages of one publisher before the others have their turn
 _KEY_LENGTH = 40  # characters of a CURVE key in Z85
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _NAME_AND_JSON = re.compile(rb"([^\s{\[\"]+)(?:\0|[ \t][ \t\0]*+)([{\[].*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class ZmqTopic(TopicOptions):
-    """A topic; ``name`` is the prefix of messages, as ZeroMQ subscribes by prefix."""
+    """A topic; ``name`` is the prefix of messages, as ZeroMQ subscribes by prefix, or a pattern.
+
+    What comes before the first ``*`` of a pattern is the prefix; messages of other topics that
+    begin with it arrive, and are left out here.
+    """
 
     type: str = option("", "json or msgpack; told apart by the first byte when absent")
     endpoint: str = option("", "its publisher, tcp://HOST:PORT; the block's when absent")
@@ -150,6 +84,7 @@ class ZmqOptions:
     )
     port: int | None = option(None, "publisher's port")
     topics: Sequence[ZmqTopic] = option((), "topics to record; all when absent")
+    exclude: Sequence[str] = option((), "names and patterns of topics to leave out on arrival")
     max_message_mb: float | None = option(
         None, "longer messages end the connection; store.queue when absent", unit="MB"
     )
@@ -165,6 +100,8 @@ class ZmqOptions:
             yield from (("endpoint", what) for what in _wrong_with(endpoint))
         for topic in self.topics:
             yield from (("topics", f"'{topic.name}': {what}") for what in self._wrong_topic(topic))
+        wrong = filter(None, map(pattern_problem, self.exclude))
+        yield from (("exclude", what) for what in wrong)
         for key in ("curve_server_key", "curve_public_key", "curve_secret_key"):
             if len(getattr(self, key)) not in (0, _KEY_LENGTH):
                 yield key, f"a CURVE key has {_KEY_LENGTH} characters (Z85)"
@@ -178,6 +115,8 @@ class ZmqOptions:
     def _wrong_topic(self, topic: ZmqTopic) -> Iterator[str]:
         if topic.type not in ("", "json", "msgpack"):
             yield f"type '{topic.type}' is neither json nor msgpack"
+        if pattern_problem(topic.name):
+            yield "** stands for whole levels, as in cam/**/image"
         endpoints = self._endpoints_of(topic)
         if not endpoints:
             yield "names no publisher; write endpoint: tcp://HOST:PORT"
@@ -191,6 +130,10 @@ class ZmqOptions:
             for endpoint in self._endpoints_of(topic):
                 found.setdefault(endpoint, []).append(topic)
         return found if self.topics else {endpoint: [] for endpoint in self._own_endpoints()}
+
+    def selection(self, topics: Sequence[ZmqTopic]) -> TopicSelection:
+        """Return what chooses among the topics of a publisher."""
+        return TopicSelection(topics, all_topics=not topics, exclude=self.exclude)
 
     def _own_endpoints(self) -> Sequence[str]:
         listed = [self.endpoint] if isinstance(self.endpoint, str) else list(self.endpoint)
@@ -244,8 +187,10 @@ class ZmqSource:
 
         context = zmq.Context()
         known_topics = _KnownTopics(sink)
-        publishers = self.config.publishers().items()
-        links = [_Link(endpoint, topics, sink, known_topics) for endpoint, topics in publishers]
+        links = [
+            _Link(endpoint, self.config.selection(topics), sink, known_topics)
+            for endpoint, topics in self.config.publishers().items()
+        ]
         poller = zmq.Poller()
         try:
             for link in links:
@@ -292,7 +237,7 @@ class _Link:
     """The connection to one publisher; ZeroMQ itself connects and connects again."""
 
     endpoint: str
-    options: Sequence[ZmqTopic]
+    selection: TopicSelection
     sink: Sink
     known_topics: _KnownTopics
     is_up: bool = False
@@ -301,23 +246,26 @@ class _Link:
     pause_s: float = _GIVEN_UP_S[0]
     continuities: dict[bytes, Continuity] = field(default_factory=dict)
     streams: dict[tuple[bytes, str], int] = field(default_factory=dict)
+    names: Collection[bytes] = ()
     seen: dict[str, None] = field(default_factory=dict)
     reported: set[str] = field(default_factory=set)
-    types: Mapping[bytes, str] = field(default_factory=dict)
+    # the type of each topic: empty if the first byte tells it, None for a topic that is left out
+    types: dict[bytes, str | None] = field(default_factory=dict)
     socket: Any = None
     monitor: Any = None
 
     def expect(self) -> None:
-        """Register the configured topics, else the remembered ones, whose gaps are opened.
+        """Register the listed topics, and the remembered ones, whose gaps are opened.
 
-        The recorder opens those of configured topics.
+        The recorder opens those of listed topics.
         """
-        self.seen = dict.fromkeys(topic.name for topic in self.options)
-        for topic in self.options:
-            found = topic.continuity()
-            if found is not None:
-                self.continuities[topic.name.encode()] = found
-        for name in () if self.options else self.known_topics.topics(self.endpoint):
+        named = self.selection.named
+        self.names = [name.encode() for name in named]
+        self.seen = dict.fromkeys(named)
+        for name in named:
+            self.types[name.encode()] = self._type_of(name)
+        known = self.known_topics.topics(self.endpoint) if self.selection.finds_topics else ()
+        for name in filter(self._is_wanted, known):
             self.seen[name] = None
             self.sink.link_down(name, self.endpoint, _PUBLISHER_MISSING, _RUN_START_NS)
 
@@ -325,7 +273,6 @@ class _Link:
         """Subscribe; returns at once, whether the publisher is there or not."""
         import zmq
 
-        self.types = {topic.name.encode(): topic.type for topic in self.options}
         self.socket = context.socket(zmq.SUB)
         # the queue must never be the place where messages are dropped: that would not be counted
         self.socket.rcvhwm = 0
@@ -340,8 +287,9 @@ class _Link:
         self.socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
         _use_keys(self.socket, config)
         self.monitor = self.socket.get_monitor_socket()
-        for prefix in self.types or (b"",):
-            self.socket.subscribe(prefix)
+        patterns = [pattern.text.partition("*")[0] for pattern, _ in self.selection.patterns]
+        for prefix in {*self.selection.named, *patterns} or {""}:
+            self.socket.subscribe(prefix.encode())
         self.socket.connect(self.endpoint)
 
     def serve(self, ready: Mapping[Any, int]) -> None:
@@ -424,13 +372,19 @@ class _Link:
             except zmq.Again:
                 return
             received_ns = self.sink.now_ns()
-            topic, payload = _split(frames, self.types)
+            topic, payload = _split(frames, self.names)
             if len(frames) > 2:
                 text = f"a message of {len(frames)} frames; those after the topic are joined"
                 self._report_once(
                     "many_frames", text, topic=topic.decode(errors="backslashreplace")
                 )
-            encoding = self.types.get(topic) or detect_encoding(payload)
+            taken += 1
+            if topic not in self.types:
+                self.types[topic] = self._type_of(_name_of(topic))
+            kind = self.types[topic]
+            if kind is None:
+                continue
+            encoding = kind or detect_encoding(payload)
             stream = self.streams.get((topic, encoding))
             if stream is None:
                 stream = self._new_stream(topic, encoding)
@@ -439,7 +393,6 @@ class _Link:
             watched = self.continuities.get(topic)
             if watched is not None:
                 self._watch(watched, topic.decode(), payload, encoding, received_ns)
-            taken += 1
 
     def _watch(
         self, watched: Continuity, topic: str, payload: bytes, encoding: str, received_ns: int
@@ -455,12 +408,32 @@ class _Link:
             reason = f"lost before the box: holes in {watched.path}"
             self.sink.lost(topic, self.endpoint, since_ns, received_ns, missing, reason)
 
+    def _type_of(self, name: str) -> str | None:
+        """Return the type of a topic seen first, and watch its numbers; None if it is left out."""
+        if not self._is_wanted(name):
+            if name == UNNAMED:
+                text = "a message whose topic is in no frame of its own fits no pattern: left out"
+                self._report_once("unnamed", text)
+            return None
+        options = self.selection.options(name)
+        if not isinstance(options, ZmqTopic):
+            return ""
+        found = options.continuity()
+        if found is not None:
+            self.continuities[name.encode()] = found
+        return options.type
+
+    def _is_wanted(self, name: str) -> bool:
+        """Return whether a topic is recorded: chosen, or one that begins with a listed name."""
+        is_below = any(map(name.startswith, self.selection.named))
+        return self.selection.chooses(name) or (is_below and not self.selection.excludes(name))
+
     def _new_stream(self, topic: bytes, encoding: str) -> int:
-        name = topic.decode(errors="backslashreplace") or UNNAMED
+        name = _name_of(topic)
         stream = self.streams[topic, encoding] = self.sink.topic(Topic(name, encoding))
         if name not in self.seen:
             self.seen[name] = None
-            if not self.options:
+            if self.selection.finds_topics:
                 self.known_topics.add(self.endpoint, name)
             if self.is_up:
                 self.sink.link_up(name, self.endpoint)
@@ -478,7 +451,11 @@ def _use_keys(socket: Any, config: ZmqOptions) -> None:
     socket.curve_serverkey = config.curve_server_key.encode()
 
 
-def _split(frames: Sequence[bytes], names: Mapping[bytes, str]) -> tuple[bytes, bytes]:
+def _name_of(topic: bytes) -> str:
+    return topic.decode(errors="backslashreplace") or UNNAMED
+
+
+def _split(frames: Sequence[bytes], names: Collection[bytes]) -> tuple[bytes, bytes]:
     """Return topic and payload of a message; a single frame may hold both."""
     if len(frames) > 1:
         return frames[0], frames[1] if len(frames) == 2 else b"".join(frames[1:])
@@ -489,9 +466,3 @@ def _split(frames: Sequence[bytes], names: Mapping[bytes, str]) -> tuple[bytes, 
     prefixes = [name for name in names if name and frame.startswith(name)]
     name = max(prefixes, key=len, default=b"")
     return name, frame[len(name) :].lstrip(b" \t\0") if name else frame
-
-
-def detect_encoding(payload: bytes) -> str:
-    """Return ``json`` or ``msgpack``: only msgpack maps and arrays start with a non-ASCII byte."""
-    is_text = payload[:1] < b"\x80" or payload.startswith(_BYTE_ORDER_MARK)
-    return "json" if is_text else "msgpack"

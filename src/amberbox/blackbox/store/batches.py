@@ -113,6 +113,7 @@ def make_batch(
         columns=rows.columns,
         topic=stream.topic.name,
         source=stream.source,
+        encoding=stream.topic.message_encoding,
     )
     if not rows.children:
         return BatchResult(batch)

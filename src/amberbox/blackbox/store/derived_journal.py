@@ -164,6 +164,7 @@ class DerivedJournal:
         self._streams = DerivedStreams()
         self._sync = SyncThread()
         self._last_ns = 0
+        self._published_seq = 0
         self._lock = threading.Lock()
 
     def now_ns(self) -> int:
@@ -189,7 +190,7 @@ class DerivedJournal:
             assert self._writer is not None
             self._sync.finish()
             self._writer.mark_sync().wait()
-            self._writer.publish_head(self._last_ns)
+            self._publish(self._writer)
 
     def append(
         self,
@@ -209,7 +210,28 @@ class DerivedJournal:
             )
             assert self._writer is not None
             self._sync.flush_if_due(self._writer.mark_sync, urgent=urgent)
-            self._writer.publish_head(self._last_ns)
+            self._publish(self._writer)
+
+    def keep_up(self) -> None:
+        """Flush and publish what was appended, and finish a file that is old enough.
+
+        For a writer that may append nothing for hours; it does not wait for the disk. Raises
+        OSError when an earlier write did not reach the disk.
+        """
+        with self._lock:
+            writer = self._writer
+            if writer is None:
+                return
+            if writer.durable_seq < writer.next_seq:
+                self._sync.flush_if_due(writer.mark_sync, urgent=True)
+            if self._published_seq < writer.durable_seq:
+                self._publish(writer)
+            if writer.rotation_due(self._log.now_ns()):
+                writer.rotate()
+
+    def _publish(self, writer: JournalWriter) -> None:
+        self._published_seq = writer.durable_seq
+        writer.publish_head(self._last_ns)
 
     def _write(self, messages: Sequence[DerivedMessage]) -> None:
         writer = self._opened()
@@ -256,6 +278,7 @@ class DerivedJournal:
             )  # fmt: skip
             chain = {} if self._chain is None else {"chain": self._chain()}
             self._writer = JournalWriter(options, **chain)
+            self._published_seq = 0
             self._streams.begin()
         return self._writer
 

@@ -35,6 +35,7 @@ from amberbox.blackbox.journal.scan import (
     JournalDamage,
     JournalWalk,
     MetadataRecord,
+    late_ns_of,
     read_chunk,
     scan,
     start_record,
@@ -80,6 +81,8 @@ class JournalFile:
     readings: tuple[ClockReading, ...] = ()
     tallies: Mapping[int, ChannelTally] | None = field(default=None, repr=False)
     """Counts of each channel, if known without reading messages."""
+    late_ns: int = 0
+    """How much before the rows written before it a row may be: its source handed it over late."""
 
     @property
     def rows(self) -> int:
@@ -197,6 +200,7 @@ def describe(found: FileScan, name: str, known: JournalFile | None = None) -> Jo
         store_id=start.get("store_id", ""),
         walked=found.walked,
         tallies=found.tallies,
+        late_ns=late_ns_of(start),
     )
     numbers = {n for n, c in found.summary.channels.items() if c.topic == channels.CLOCK}
     read, readings = (len(known.places), known.readings) if known else (0, ())
@@ -432,7 +436,7 @@ def holes(journal: JournalFile) -> list[Gap]:
 
 def missing(journal: JournalFile, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Gap:
     """Return the gap of rows that were written and cannot be read."""
-    start, end = ClockTable(journal.clock).span(from_ns, to_ns)
+    start, end = ClockTable(journal.clock).span(from_ns, max(from_ns, to_ns))
     return Gap(
         journal.writer,
         journal.run,

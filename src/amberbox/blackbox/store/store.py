@@ -23,6 +23,7 @@ from amberbox.blackbox.robot_folder.folder import store_of
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.files import below, is_file_locked, replace_file, try_lock
 
+KEPT = "kept"  # writer of the box's own records that outlast the data around them
 # Folder of each writer's journal, inside the store
 FOLDERS = {
     "main": "journal",
@@ -30,13 +31,15 @@ FOLDERS = {
     "ring": "ring",
     "watch": "watch",
     "keep": "keep",
-    "kept": "kept",
+    KEPT: "kept",
     "act": "act",
+    "experiment": "experiment",
+    "detect": "detect",
 }
 INCIDENTS = "incidents"
 IDENTITY = "store.json"
 _RUN = "run"
-_LOCKS = {"keep": "keeper", "kept": "keeper"}  # locks of the writers that are not called like these
+_LOCKS = {"keep": "keeper", KEPT: "keeper"}  # locks of the writers that are not called like these
 _WITNESSES = 3  # how many journals of each writer are read for the store's identity
 
 
@@ -219,7 +222,7 @@ class WriterLock:
 
 def is_locked(store: Store, writer: str) -> bool:
     """Return whether a process is writing this journal right now."""
-    return is_file_locked(store.path / f"lock.{writer}")
+    return is_file_locked(store.path / f"lock.{_LOCKS.get(writer, writer)}")
 
 
 def being_written(path: Path) -> bool:
@@ -227,7 +230,7 @@ def being_written(path: Path) -> bool:
     folder, store = path.parent, Store(path.parent.parent, "")
     writer = next((writer for writer, name in FOLDERS.items() if name == folder.name), "")
     newest = max(folder.glob("*.mcap"), key=run_and_number, default=None)
-    return newest == path and is_locked(store, _LOCKS.get(writer, writer))
+    return newest == path and is_locked(store, writer)
 
 
 def run_and_number(path: Path) -> tuple[int, int]:
@@ -253,12 +256,18 @@ class StoreRequest:
     values: Mapping[str, Any]
 
 
-def submit(store: Store, kind: str, values: Mapping[str, Any]) -> Path:
-    """Write a request that survives a power cut; its file is removed once it is carried out."""
+def submit(store: Store, kind: str, values: Mapping[str, Any], name: str = "") -> Path:
+    """Write a request that survives a power cut; its file is removed once it is carried out.
+
+    One with a ``name`` that waits already is left as it is.
+    """
     folder = store.path / REQUESTS
     folder.mkdir(exist_ok=True)
+    known = next(folder.glob(f"*-{name}.json"), None) if name else None
+    if known is not None:
+        return known
     wall_ns, boot_ns = time.time_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-    path = folder / f"{boot_ns:020d}-{os.getpid()}-{uuid.uuid4().hex[:8]}.json"
+    path = folder / f"{boot_ns:020d}-{name or f'{os.getpid()}-{uuid.uuid4().hex[:8]}'}.json"
     document = {"kind": kind, "wall_ns": wall_ns, "boot_ns": boot_ns, "values": dict(values)}
     replace_file(path, json.dumps(document))
     return path
@@ -267,7 +276,8 @@ def submit(store: Store, kind: str, values: Mapping[str, Any]) -> Path:
 def pending(store: Store) -> list[StoreRequest]:
     """Return the requests that are not finished yet, oldest first.
 
-    A file that is not a request is renamed to ``<name>.refused``; only the keeper calls this.
+    A file that is not a request is renamed to ``<name>.refused``, with an event. Each process takes
+    the kinds that are its own.
     """
     found = []
     for path in sorted((store.path / REQUESTS).glob("*.json")):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -19,6 +20,7 @@ from amberbox.blackbox.store.catalogue import StoreCatalogue, item_of
 from amberbox.blackbox.store.journal_reader import JournalFile, batches_of, inside
 from amberbox.blackbox.store.manifest_entries import Segment, SegmentPart
 from amberbox.blackbox.store.segment_file import overlaps, read_segment
+from amberbox.blackbox.store.store import KEPT
 from amberbox.core.types import ColumnData, Gap, IntArray
 
 TimeSpan: TypeAlias = tuple[int | None, int | None]
@@ -67,9 +69,43 @@ def gather(catalogue: StoreCatalogue, request: RowRequest) -> GatheredRows:
             note_damaged(found, catalogue, segment, "it or its line of the manifest is gone")
     if not catalogue.with_segments:
         note_unreadable(found, catalogue, request)
-    pieces = (within(piece, request.span, request.by) for piece in found.pieces)
+    pieces = (within(piece, request.span, request.by) for piece in without_copies(found.pieces))
     found.pieces = [piece for piece in pieces if len(piece)]
     return found
+
+
+def without_copies(pieces: Sequence[FlatTable]) -> list[FlatTable]:
+    """Leave out rows of the kept journal whose originals are there, too.
+
+    They are copied before a journal is deleted; both are there until it is, which may be later when
+    the power fails meanwhile.
+    """
+    originals: dict[int, Counter[tuple[str, ...]]] = {}
+    copied = {int(at) for p in pieces if p.writer == KEPT for at in p.received_ns}
+    for piece in pieces if copied else ():
+        if piece.writer != KEPT:
+            for row in np.flatnonzero(np.isin(piece.received_ns, [*copied])).tolist():
+                at_ns = int(piece.received_ns[row])
+                originals.setdefault(at_ns, Counter())[_values(piece, row)] += 1
+    if not originals:
+        return list(pieces)
+    return [_new_rows(p, originals) if p.writer == KEPT else p for p in pieces]
+
+
+def _new_rows(piece: FlatTable, originals: Mapping[int, Counter[tuple[str, ...]]]) -> FlatTable:
+    rows = []
+    for row, at_ns in enumerate(piece.received_ns.tolist()):
+        known, values = originals.get(at_ns, Counter()), _values(piece, row)
+        if known[values]:
+            known[values] -= 1
+        else:
+            rows.append(row)
+    return piece.take(np.array(rows, np.int64))
+
+
+def _values(piece: FlatTable, row: int) -> tuple[str, ...]:
+    one = piece.take(np.array([row]))
+    return tuple(f"{name}={one.columns[name]!r}" for name in sorted(one.columns))
 
 
 def _segment_rows(catalogue: StoreCatalogue, request: RowRequest) -> Iterator[FlatTable]:
@@ -159,7 +195,7 @@ def from_journals(catalogue: StoreCatalogue, request: RowRequest) -> GatheredRow
     """Read only the rows that are in no segment."""
     found = GatheredRows()
     _add_journals(found, catalogue, request)
-    found.pieces = [piece for piece in found.pieces if len(piece)]
+    found.pieces = [piece for piece in without_copies(found.pieces) if len(piece)]
     return found
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from amberbox.blackbox.journal import channels
 from amberbox.blackbox.journal.chunk import Chunk, decode_own_messages, open_buffer, sequences
 from amberbox.blackbox.journal.mcap import read_summary
-from amberbox.blackbox.journal.scan import ChunkPlace, start_record
+from amberbox.blackbox.journal.scan import ChunkPlace, late_ns_of, start_record
 from amberbox.blackbox.journal.tail import FileTail, JournalHead, read_head
 from amberbox.blackbox.store.batches import BatchOrigin, ItemStream, make_batch, stream_of
 from amberbox.blackbox.store.clocks import ClockTable, held_points
@@ -157,6 +157,7 @@ class _Live:
     schemas: dict[int, Schema] = field(default_factory=dict)
     streams: dict[int, ItemStream] = field(default_factory=dict)
     clock: list[tuple[int, int]] = field(default_factory=list)
+    late_ns: int = 0
 
 
 class WriterTail:
@@ -174,6 +175,9 @@ class WriterTail:
         self._live: _Live | None = None
         self._gone = DeletedJournals(store, writer)
         self.last_ns: int | None = None
+        # log time up to which the rows read are all that there will be, by the file alone
+        self.complete_ns: int | None = None
+        self.late_ns = 0  # how much before earlier rows the rows of the present file may be
         self._watermark: tuple[int, int, int] = (0, 0, 0)
 
     def position(self) -> WriterCursor:
@@ -218,6 +222,9 @@ class WriterTail:
         elif journal.damage and _ends_damaged(journal):
             gap = missing(journal, self.seq, self.seq, last_ns, last_ns)
             yield self._at(replace(gap, count=None, to_seq=None))
+        if journal.late_ns and journal.rows:  # the next file begins after all rows of this one
+            self.complete_ns = journal.end_ns
+            yield from self._mark(clock.at(journal.end_ns), self._durable_seq())
         self._ends_at = (journal.run, journal.end_seq)
         self._done = run_and_number(path)
 
@@ -251,7 +258,7 @@ class WriterTail:
                     self.ahead[delivery.item] = int(delivery.seq[-1]) + 1
                 yield self._at(delivery)
             self.seq, self.ahead = end_seq, {}
-        self.last_ns = journal.end_ns
+        self.last_ns = self.complete_ns = journal.end_ns
         self._ends_at = (stretch.run, stretch.end_seq)
         self._done = max(self._done, journal.place)
 
@@ -259,7 +266,8 @@ class WriterTail:
         """Yield the rows added to the file being written."""
         live = self._live
         if live is None or live.tail.path != path:
-            live = self._live = _Live(FileTail(path))
+            late_ns = late_ns_of(start_record(path))
+            live = self._live = _Live(FileTail(path), late_ns=late_ns)
         for chunk in live.tail.chunks():
             yield from self._live_chunk(live, chunk)
 
@@ -324,11 +332,14 @@ class WriterTail:
         self.seq, self.ahead = end, {}
         self.last_ns = int(chunk.log_ns.max())
         yield from map(self._at, gap_records(chunk, self.writer, self.run, clock))
-        # Everything before the last row of a chunk has been delivered.
-        received = clock.at(self.last_ns)
+        # Everything before the last row of a chunk has been delivered, but for late rows.
+        self.late_ns = journal.late_ns
+        self.complete_ns = self.last_ns - journal.late_ns
+        yield from self._mark(clock.at(self.complete_ns), self._durable_seq())
+
+    def _durable_seq(self) -> int:
         head = read_head(self.store.folder(self.writer))
-        durable = head.durable_seq if head and head.run == self.run else self.seq
-        yield from self._mark(received, durable)
+        return head.durable_seq if head and head.run == self.run else self.seq
 
     def _read_to(self, item: str) -> int:
         return max(self.seq, self.ahead.get(item, 0))
@@ -388,7 +399,7 @@ def _outline(live: _Live, writer: str) -> JournalFile:
         name=f"{path.parent.name}/{path.name}", path=path, writer=writer, run=run,
         number=number, first_seq=live.tail.first_seq, end_seq=0, start_ns=0, end_ns=0,
         finished=False, items={}, bytes=0, clock=tuple(live.clock), chain="",
-        streams=live.streams, places=(),
+        streams=live.streams, places=(), late_ns=live.late_ns,
     )  # fmt: skip
 
 
@@ -468,6 +479,47 @@ def _time_of(journal: JournalFile, cursor: WriterCursor | None) -> int:
 RECORDED = ("main", "bulk", "ring")
 
 
+class RecordFollower:
+    """Follows the journals of a store; ``step`` yields what is new, in the terms of ``follow``.
+
+    Raises UsageError when there is no store at ``where``.
+    """
+
+    def __init__(
+        self,
+        where: str | Path,
+        items: Collection[str] | None = None,
+        cursor: Cursor | None = None,
+        lookback_s: float = 0.0,
+        writers: Sequence[str] = RECORDED,
+    ) -> None:
+        self._store = open_store(store_path(where))
+        self._items, self._lookback_s, self._writers = items, lookback_s, writers
+        self._foreign = ""
+        known = cursor if cursor is not None and cursor.store_id == self._store.id else None
+        if cursor is not None and known is None:
+            self._foreign = f"the cursor is of another store ({cursor.store_id}): starting anew"
+        self._floor = known.writers if known else {}
+        self._tails: dict[str, WriterTail] = {}
+
+    def step(self) -> Iterator[Delivery]:
+        """Yield the deliveries since the last step."""
+        if self._foreign:
+            foreign, self._foreign = self._foreign, ""
+            yield Gap("", 0, 0, 0, foreign)
+        for writer in self._store.writers():
+            if writer in self._writers and writer not in self._tails:
+                at = self._floor.get(writer)
+                start = position_at(self._store, writer, at, self._lookback_s)
+                self._tails[writer] = WriterTail(self._store, writer, self._items, start)
+        for writer, tail in self._tails.items():
+            for delivery in tail.step():
+                at_all = {w: t.position() for w, t in self._tails.items()}
+                at_all[writer] = delivery.cursor.writers[writer]
+                here = {w: _not_before(p, self._floor.get(w)) for w, p in at_all.items()}
+                yield replace(delivery, cursor=Cursor(self._store.id, {**self._floor, **here}))
+
+
 def follow(
     where: str | Path,
     items: Collection[str] | None = None,
@@ -490,25 +542,13 @@ def follow(
 
     Raises UsageError when there is no store at ``where``.
     """
-    store = open_store(store_path(where))
+    follower = RecordFollower(where, items, cursor, lookback_s, writers)
     stop = stop or threading.Event()
-    known = cursor if cursor is not None and cursor.store_id == store.id else None
-    if cursor is not None and known is None:
-        yield Gap("", 0, 0, 0, f"the cursor is of another store ({cursor.store_id}): starting anew")
-    tails: dict[str, WriterTail] = {}
-    floor = known.writers if known else {}
     while True:
-        for writer in (w for w in store.writers() if w in writers and w not in tails):
-            start = position_at(store, writer, floor.get(writer), lookback_s)
-            tails[writer] = WriterTail(store, writer, items, start)
         moved = False
-        for writer, tail in tails.items():
-            for delivery in tail.step():
-                moved = True
-                at = {w: t.position() for w, t in tails.items()}
-                at[writer] = delivery.cursor.writers[writer]
-                here = {w: _not_before(position, floor.get(w)) for w, position in at.items()}
-                yield replace(delivery, cursor=Cursor(store.id, {**floor, **here}))
+        for delivery in follower.step():
+            moved = True
+            yield delivery
         if not moved and (not live or stop.wait(poll_s)):
             return
 

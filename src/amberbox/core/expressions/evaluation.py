@@ -60,20 +60,37 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Instants:
-    """Where to evaluate: instants of time, or a range of rows of series that share their times.
+class WindowCache:
+    """What windows of expressions over the same samples share at the same instants."""
 
-    ``has_time`` is False where only current values are known.
-    """
+    results: dict[str, Any] = field(default_factory=dict)
+    """Values of windows, by their text."""
+    looked_up: dict[int, dict[str, Values]] = field(default_factory=dict)
+    """Samples in windows of a length, by address."""
+    computed: dict[int, dict[str, Values]] = field(default_factory=dict)
+    """What is computed of these, by its text."""
+
+    def inside(
+        self, over_ns: int, series: Mapping[str, Series], times_ns: IntArray, rows: slice
+    ) -> Instants:
+        """Return the samples in windows of a length, at the times of their addresses."""
+        looked_up = self.looked_up.setdefault(over_ns, {})
+        computed = self.computed.setdefault(over_ns, {})
+        return Instants(series, times_ns, rows, looked_up=looked_up, computed=computed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instants:
+    """Where to evaluate: instants of time, or a range of rows of series that share their times."""
 
     series: Mapping[str, Series]
     times_ns: IntArray
     rows: slice | None = None
-    has_time: bool = True
     looked_up: dict[str, Values] = field(default_factory=dict)
     """Values of addresses at the instants, each found once."""
-    windows: dict[str, Values] = field(default_factory=dict)
-    """Values of windows at the instants, likewise, by their text."""
+    computed: dict[str, Values] = field(default_factory=dict)
+    """Results of arithmetic at the instants, likewise, by their text."""
+    windows: WindowCache = field(default_factory=WindowCache)
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -163,9 +180,12 @@ def _negative_column(tree: NegativeNode, where: Instants) -> Values:
 
 
 def _arithmetic_column(tree: ArithmeticNode, where: Instants) -> Values:
-    sign = tree.operator
-    left, right = (_number_column(part, where, f"'{sign}'") for part in (tree.left, tree.right))
-    return on.arithmetic(sign, left, right)
+    found = where.computed.get(tree.text)
+    if found is None:
+        by = f"'{tree.operator}'"
+        sides = [_number_column(part, where, by) for part in (tree.left, tree.right)]
+        found = where.computed[tree.text] = on.arithmetic(tree.operator, *sides)
+    return found
 
 
 def _comparison_column(tree: ComparisonNode, where: Instants) -> Values:
@@ -191,7 +211,6 @@ def _call_column(tree: CallNode, where: Instants) -> Values:
 
 
 def _age_column(tree: AgeNode, where: Instants) -> Values:
-    _require_time(tree, where.has_time)
     series = where.series[tree.inner.name]
     known_ns = series.times_ns[~series.values.null]
     if not len(known_ns):
@@ -202,10 +221,9 @@ def _age_column(tree: AgeNode, where: Instants) -> Values:
 
 
 def _window_column(tree: WindowNode, where: Instants) -> Values:
-    _require_time(tree, where.has_time)
-    found = where.windows.get(tree.text)
+    found: Values | None = where.windows.results.get(tree.text)
     if found is None:
-        found = where.windows[tree.text] = _reduced(tree, where)
+        found = where.windows.results[tree.text] = _reduced(tree, where)
     return found
 
 
@@ -243,7 +261,8 @@ def _samples(tree: WindowNode, where: Instants) -> tuple[IntArray, Values]:
     if len(clocks) == 1 and not tree.is_nested:
         rows = slice(*(int(np.searchsorted(clocks[0], t, "right")) for t in (since, until)))
         times_ns = clocks[0][rows]
-        return times_ns, value_of(tree.inner, Instants(where.series, times_ns, rows))
+        inside = where.windows.inside(tree.over_ns, where.series, times_ns, rows)
+        return times_ns, value_of(tree.inner, inside)
     times_ns = _between([(clock, 0) for clock in clocks], since, until)
     return times_ns, value_of(tree.inner, where.moved(times_ns))
 
@@ -253,7 +272,6 @@ def _held_column(tree: HeldNode, where: Instants) -> Values:
 
     The condition can only change at its breakpoints, so it is evaluated there and at both ends.
     """
-    _require_time(tree, where.has_time)
     if not len(where):
         return on.constant(None, 0)
     start_ns = where.times_ns - tree.for_ns
@@ -326,21 +344,18 @@ class InstantView:
         self,
         at_ns: int,
         tracks: Mapping[str, Track],
-        has_time: bool = True,
-        windows: dict[str, Any] | None = None,
+        windows: WindowCache | None = None,
     ) -> None:
         self.at_ns = at_ns
         self.tracks = tracks
-        self.has_time = has_time
-        self.windows = {} if windows is None else windows
-        """Values of windows at the instant, each computed once, by their text."""
+        self.windows = WindowCache() if windows is None else windows
         self.values: dict[str, Any] = {}
 
     @cached_property
     def whole(self) -> Instants:
         """The instant as one of many, over all samples."""
         series = {name: track.series() for name, track in self.tracks.items()}
-        return Instants(series, np.array([self.at_ns], np.int64), has_time=self.has_time)
+        return Instants(series, np.array([self.at_ns], np.int64))
 
     def take(self, names: Sequence[str]) -> tuple[Kind, ...]:
         """Read the present values of variables; return their kinds."""
@@ -432,10 +447,14 @@ def _logic_at(tree: LogicNode, kinds: Kinds) -> tuple[At, Kind]:
 
 def _joined(decisive: bool, parts: Sequence[At]) -> At:
     def joined(view: InstantView) -> bool | None:
-        values = [part(view) for part in parts]
-        if decisive in values:
-            return decisive
-        return None if None in values else not decisive
+        found: bool | None = not decisive
+        for part in parts:
+            value = part(view)
+            if value == decisive:
+                return decisive
+            if value is None:
+                found = None
+        return found
 
     return joined
 
@@ -461,15 +480,19 @@ def _of_known(function: Callable[..., Any], *parts: At) -> At:
         return of_one
 
     def of_all(view: InstantView) -> Any:
-        values = [part(view) for part in parts]
-        return None if None in values else function(*values)
+        values = []
+        for part in parts:
+            value = part(view)
+            if value is None:
+                return None
+            values.append(value)
+        return function(*values)
 
     return of_all
 
 
 def _age_at(tree: AgeNode, kinds: Kinds) -> tuple[At, Kind]:
     def age_s(view: InstantView) -> float | None:
-        _require_time(tree, view.has_time)
         times_ns, data, null, kind, _ = view.tracks[tree.inner.name]
         last = int(times_ns.searchsorted(view.at_ns, "right")) - 1
         if null is None and kind is None:
@@ -483,10 +506,10 @@ def _age_at(tree: AgeNode, kinds: Kinds) -> tuple[At, Kind]:
 
 def _window_at(tree: WindowNode, kinds: Kinds) -> tuple[At, Kind]:
     def window(view: InstantView) -> Any:
-        _require_time(tree, view.has_time)
-        if tree.text not in view.windows:
-            view.windows[tree.text] = worked_out(view)
-        return view.windows[tree.text]
+        known = view.windows.results
+        if tree.text not in known:
+            known[tree.text] = worked_out(view)
+        return known[tree.text]
 
     def worked_out(view: InstantView) -> Any:
         clock = None if tree.is_nested else _one_clock([view.tracks[name] for name in tree.reads])
@@ -495,8 +518,10 @@ def _window_at(tree: WindowNode, kinds: Kinds) -> tuple[At, Kind]:
         first = int(clock.searchsorted(view.at_ns - tree.over_ns, "right"))
         rows = slice(first, int(clock.searchsorted(view.at_ns, "right")))
         times_ns = clock[rows]
-        looked_up = {name: view.tracks[name].part(rows) for name in tree.reads}
-        inside = Instants({}, times_ns, looked_up=looked_up)
+        inside = view.windows.inside(tree.over_ns, {}, times_ns, rows)
+        for name in tree.reads:
+            if name not in inside.looked_up:
+                inside.looked_up[name] = view.tracks[name].part(rows)
         values = value_of(tree.inner, inside)
         if tree.name == "count":
             return int(np.count_nonzero(counted(values)))
@@ -520,7 +545,6 @@ def _held_at(tree: HeldNode, kinds: Kinds) -> tuple[At, Kind]:
     now = _condition_at(tree.inner, kinds, "'for'")
 
     def held(view: InstantView) -> Any:
-        _require_time(tree, view.has_time)
         return False if now(view) is False else value_of(tree, view.whole).scalar(0)
 
     return held, "condition"
@@ -528,11 +552,6 @@ def _held_at(tree: HeldNode, kinds: Kinds) -> tuple[At, Kind]:
 
 def _built(tree: ExpressionNode, kinds: Kinds) -> tuple[At, Kind]:
     return _NODES[type(tree)][1](tree, kinds)
-
-
-def _require_time(tree: ExpressionNode, has_time: bool) -> None:
-    if not has_time:
-        raise ExpressionFault("needs the past, only current values are known here", tree.at)
 
 
 _NODES: Mapping[

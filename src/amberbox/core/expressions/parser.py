@@ -22,6 +22,7 @@ from amberbox.core.expressions.tree import (
     NegativeNode,
     NotNode,
     WindowNode,
+    height,
     kind_of,
     status_address,
 )
@@ -134,6 +135,7 @@ _COMPARISONS = frozenset({"<", "<=", ">", ">=", "==", "!="})
 _CONSTANTS: dict[str, bool | None] = {"true": True, "false": False, "null": None}
 _LONGEST = 10_000
 _DEEPEST = 50
+_HIGHEST = 200  # a sum of n terms is a tree of height n: whoever walks it goes so deep
 
 
 def parse_tree(text: str) -> ExpressionNode:
@@ -144,6 +146,9 @@ def parse_tree(text: str) -> ExpressionNode:
     tree = parser.either()
     if parser.next.sort != "end":
         raise ExpressionFault(*_unexpected(parser.next))
+    if height(tree) > _HIGHEST:
+        what = f"has more than {_HIGHEST} terms in a row, or parts within parts"
+        raise ExpressionFault(what, 0, "divide it into several conditions")
     return tree
 
 

@@ -48,13 +48,24 @@ class NegativeNode(ExpressionNode):
     inner: ExpressionNode
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ArithmeticNode(ExpressionNode):
     """``x + y`` and ``- * / %``."""
 
     operator: str
     left: ExpressionNode
     right: ExpressionNode
+
+    @cached_property
+    def text(self) -> str:
+        """Return its text without its place: equal for equal nodes."""
+        chain = [self]  # of a long sum, without a recursion as deep
+        while isinstance(chain[-1].left, ArithmeticNode):
+            chain.append(chain[-1].left)
+        text = _text_of(chain[-1].left)
+        for node in reversed(chain):
+            text = f"({text}{node.operator}{_text_of(node.right)})"
+        return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +127,7 @@ class WindowNode(ExpressionNode):
     @cached_property
     def text(self) -> str:
         """Return its text without its place: equal for equal windows."""
-        return _text_of(self)
+        return _parts_of(self)
 
 
 @dataclass(frozen=True)
@@ -198,6 +209,14 @@ def walk(tree: ExpressionNode) -> Iterator[ExpressionNode]:
         yield from walk(child)
 
 
+def height(tree: ExpressionNode) -> int:
+    """Return how many nodes are above each other at most."""
+    level, found = [tree], 0
+    while level:
+        level, found = [child for node in level for child in children(node)], found + 1
+    return found
+
+
 def with_addresses(
     tree: ExpressionNode, change: Callable[[AddressNode], AddressNode]
 ) -> ExpressionNode:
@@ -246,10 +265,14 @@ def _text_of(value: object) -> str:
     """Return a part as text, without its place."""
     if isinstance(value, tuple):
         return f"({','.join(map(_text_of, value))})"
-    if not isinstance(value, ExpressionNode):
-        return repr(value)
-    parts = (getattr(value, one.name) for one in dataclasses.fields(value) if one.name != "at")
-    return f"{type(value).__name__}({','.join(map(_text_of, parts))})"
+    if isinstance(value, ArithmeticNode | WindowNode):
+        return value.text
+    return _parts_of(value) if isinstance(value, ExpressionNode) else repr(value)
+
+
+def _parts_of(node: ExpressionNode) -> str:
+    parts = (getattr(node, one.name) for one in dataclasses.fields(node) if one.name != "at")
+    return f"{type(node).__name__}({','.join(map(_text_of, parts))})"
 
 
 def addresses_of(tree: ExpressionNode) -> tuple[str, ...]:

@@ -245,12 +245,13 @@ class ActionClient:
             with self._changed:
                 tracker.advance(time.monotonic())
                 state, text, feedback = tracker.state, tracker.text, tracker.feedback
-            if state and state != told[0]:
+            if state and state != told[0] and state not in ENDED:
                 state_changed(state, text)
             if feedback is not None and feedback is not told[1]:
                 feedback_came(feedback)
             told = (state, feedback)
             if state != "" and state in ENDED:
+                state_changed(state, text)  # after the feedback, which came before
                 return GoalOutcome(state, text, tracker.result, tracker.feedback)
             deadline.check(f"the goal of {self.name} is still {state or 'not taken'}")
             with self._changed:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from queue import SimpleQueue
@@ -33,29 +33,32 @@ from amberbox.blackbox.sources.ros1.subscription import (
 )
 from amberbox.core.source import Sink
 from amberbox.core.tls import is_loopback
+from amberbox.core.topic_selection import TopicSelection
 
 LONGEST_WAIT_S = 2.0
 FAILURE_CHECK_S = 0.2
 STOP_S = 0.3
 NEVER_NS = 1  # time of the last request to the master before the first one: gaps begin with the run
 STOPPED = "the recorder stopped listening"
-NOT_FOLLOWED = frozenset({"/rosout", "/rosout_agg"})
 
 Update = tuple[str, Sequence[str]]
 
 
 class RosSubscriber:
-    """Subscribes to topics (name to configured type, empty for any) until stopped."""
+    """Subscribes to the topics that a selection chooses until stopped."""
 
-    def __init__(self, settings: SubscriberSettings, topics: Mapping[str, str], sink: Sink) -> None:
+    def __init__(self, settings: SubscriberSettings, selection: TopicSelection, sink: Sink) -> None:
         self._settings = settings
+        self._selection = selection
         self._sink = sink
         self._memory = PublisherHistory(sink)
-        self._reports = RosEvents(sink, topics)
+        self._reports = RosEvents(sink, selection)
         self._master = RosMaster(settings)
         self._subscriptions: dict[str, TopicSubscription] = {}
         self._registered: set[str] = set()
         self._silent_since: dict[str, float] = {}
+        self._types: Mapping[str, str] = {}
+        self._unmatched = [pattern for pattern, _ in selection.patterns]
         self._updates: SimpleQueue[Update | None] = SimpleQueue()
         self._node: NodeServer | None = None
         self._own_uri = ""
@@ -65,8 +68,9 @@ class RosSubscriber:
         self._building = threading.Lock()
         self._queried_ns = NEVER_NS
         self._queried_nodes: set[str] = set()
-        remembered = set(self._memory.topics()) if settings.all_topics else set()
-        for topic in topics.keys() | (remembered - NOT_FOLLOWED):
+        memory = self._memory
+        remembered = {t for t in memory.topics() if selection.chooses(t, memory.type_of(t))}
+        for topic in selection.named.keys() | remembered:
             self._subscribe(topic)
 
     def run(self, stop: threading.Event) -> None:
@@ -135,31 +139,44 @@ class RosSubscriber:
             graph = self._master.graph()
             self._reports.master_found(self._settings.master_uri)
             self._failures = 0
-            if self._settings.all_topics:
-                for topic in graph.publishers.keys() - self._subscriptions.keys() - NOT_FOLLOWED:
-                    with self._changing:
-                        if not self._ending.is_set():
-                            self._subscribe(topic)
+            if self._selection.finds_topics:
+                self._subscribe_found(graph.publishers.keys() - self._subscriptions.keys())
             self._register(graph)
             self._poll(asked_ns, graph)
             self._queried_ns = asked_ns
-            if self._settings.all_topics:
+            if self._selection.finds_topics:
                 self._query_forgotten_nodes(graph)
         except RosError as error:
             self._failures += 1
             if not self._ending.is_set():
                 self._reports.master_lost(self._settings.master_uri, error)
 
+    def _subscribe_found(self, published: Set[str]) -> None:
+        """Subscribe to those published topics that the selection chooses."""
+        if self._selection.needs_types and published - self._types.keys():
+            known = self._master.topic_types()
+            self._types = {topic: known[topic] for topic in published & known.keys()}
+        for topic in published:
+            if self._selection.chooses(topic, self._types.get(topic, "")):
+                with self._changing:
+                    if not self._ending.is_set():
+                        self._subscribe(topic)
+
     def _query_forgotten_nodes(self, graph: SystemState) -> None:
         """Request the other topics of connected nodes that the master does not list, once each."""
         found: dict[str, set[str]] = {}
+        types: dict[str, str] = {}
         for topic, subscription in list(self._subscriptions.items()):
             for uri in subscription.unlisted(graph.publishers.get(topic, ())) - self._queried_nodes:
                 self._queried_nodes.add(uri)
                 with suppress(RosError):  # its open connections go on
-                    for other in publications(uri, self._settings):
+                    published = publications(uri, self._settings)
+                    types |= published
+                    for other in published:
                         found.setdefault(other, set()).add(uri)
-        for topic in found.keys() - NOT_FOLLOWED - graph.publishers.keys():
+        for topic in found.keys() - graph.publishers.keys():
+            if not self._selection.chooses(topic, types[topic]):
+                continue
             with self._changing:
                 if topic not in self._subscriptions and not self._ending.is_set():
                     self._subscribe(topic)
@@ -203,6 +220,11 @@ class RosSubscriber:
                 del self._silent_since[topic]
             elif now_s - since_s >= self._settings.unknown_after_s:
                 self._reports.unknown_topic(topic, graph.publishers.keys() - {topic})
+        self._unmatched = [p for p in self._unmatched if not any(map(p.fits, self._subscriptions))]
+        for pattern in self._unmatched:
+            since_s = self._silent_since.setdefault(pattern.text, time.monotonic())
+            if time.monotonic() - since_s >= self._settings.unknown_after_s:
+                self._reports.unknown_topic(pattern.text, graph.publishers.keys())
 
     def _delay_s(self) -> float:
         if not self._failures:

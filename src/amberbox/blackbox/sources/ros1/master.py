@@ -44,7 +44,6 @@ class SubscriberSettings(NodeSettings):
     """Settings of the subscriber; the defaults of its times are changed by tests only."""
 
     invisible: bool = False
-    all_topics: bool = False
     poll_s: float = 1.0
     unknown_after_s: float = 10.0
     listed_retry_s: float = 2.0
@@ -237,6 +236,8 @@ _READERS: dict[str, Callable[[Element], Any]] = {
     "boolean": lambda element: bool(_number(element)),
     "double": lambda element: float(element.text or ""),
     "nil": lambda element: None,
+    "base64": _text,
+    "dateTime.iso8601": _text,
 }
 
 
@@ -328,10 +329,11 @@ class RosApi:
 
 @dataclass(frozen=True)
 class SystemState:
-    """Publishers and subscribers of all topics, as known to the master."""
+    """The nodes behind all topics and services, as known to the master."""
 
     publishers: Mapping[str, Sequence[str]]
     subscribers: Mapping[str, Sequence[str]]
+    services: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 class RosMaster:
@@ -341,12 +343,26 @@ class RosMaster:
         self._api = RosApi(settings.master_uri, settings)
 
     def graph(self) -> SystemState:
-        """Return the publishers and subscribers of all topics."""
+        """Return the publishers and subscribers of all topics, and who offers services."""
         try:
-            publishers, subscribers, _ = self._api.call("getSystemState")
-            return SystemState(_nodes_by_topic(publishers), _nodes_by_topic(subscribers))
+            return SystemState(*map(_nodes_by_name, self._api.call("getSystemState")))
         except (TypeError, ValueError) as error:
             raise RosNoAnswerError(f"{self._api.uri} gave no system state: {error}") from error
+
+    def topic_types(self) -> dict[str, str]:
+        """Return the types of the topics as far as they are known."""
+        try:
+            pairs = self._api.call("getTopicTypes")
+            return {str(topic): str(kind) for topic, kind in pairs if kind != "*"}
+        except (TypeError, ValueError) as error:
+            raise RosNoAnswerError(f"{self._api.uri} gave no topic types: {error}") from error
+
+    def parameters(self) -> dict[str, Any]:
+        """Return all parameters as a tree."""
+        tree = self._api.call("getParam", "/")
+        if not isinstance(tree, dict):
+            raise RosNoAnswerError(f"{self._api.uri} gave no parameters")
+        return tree
 
     def node_uri(self, node: str) -> str:
         """Return the URI of a node; RefusedError if the master does not know it."""
@@ -377,8 +393,8 @@ class RosMaster:
         self._api.close()
 
 
-def _nodes_by_topic(pairs: Any) -> dict[str, list[str]]:
-    return {str(topic): [str(node) for node in nodes] for topic, nodes in pairs}
+def _nodes_by_name(pairs: Any) -> dict[str, list[str]]:
+    return {str(name): [str(node) for node in nodes] for name, nodes in pairs}
 
 
 def request_topic(node_uri: str, topic: str, settings: NodeSettings) -> tuple[str, int]:
@@ -397,11 +413,11 @@ def request_topic(node_uri: str, topic: str, settings: NodeSettings) -> tuple[st
         api.close()
 
 
-def publications(node_uri: str, settings: NodeSettings) -> list[str]:
-    """Return the topics that a node publishes."""
+def publications(node_uri: str, settings: NodeSettings) -> dict[str, str]:
+    """Return the topics that a node publishes, with their types."""
     api = RosApi(node_uri, settings)
     try:
-        return [str(topic) for topic, _ in api.call("getPublications")]
+        return {str(topic): str(kind) for topic, kind in api.call("getPublications")}
     except (TypeError, ValueError) as error:
         raise RosNoAnswerError(f"{node_uri} gave no publications: {error}") from error
     finally:

@@ -20,6 +20,7 @@ from amberbox.blackbox.sources.ros1.master import (
     NodeSettings,
     RosError,
     RosMaster,
+    SystemState,
     host_and_port,
     own_host,
     request_topic,
@@ -32,7 +33,12 @@ from amberbox.blackbox.sources.ros1.tcpros import (
     connect,
     read_answer,
 )
-from amberbox.blackbox.sources.ros1.topic_server import OfferedTopic, TopicServer
+from amberbox.blackbox.sources.ros1.topic_server import (
+    MOST_CONNECTIONS,
+    OfferedTopic,
+    Patience,
+    TopicServer,
+)
 from amberbox.core.errors import AmberboxError
 from amberbox.core.tls import is_loopback
 
@@ -157,7 +163,12 @@ class RosNode:
     that crashed leaves no trace of it.
     """
 
-    def __init__(self, settings: NodeSettings, deadline: Deadline) -> None:
+    def __init__(
+        self,
+        settings: NodeSettings,
+        deadline: Deadline,
+        most_connections: int = MOST_CONNECTIONS,
+    ) -> None:
         limit = min(settings.message_limit, MOST_BYTES)
         self.settings = replace(settings, message_limit=limit)
         self._readers: dict[str, TopicReader] = {}
@@ -171,7 +182,7 @@ class RosNode:
         )
         self._registered: list[tuple[str, bool]] = []
         try:
-            self._topics = TopicServer(bind_host, settings.caller_id)
+            self._topics = TopicServer(bind_host, settings.caller_id, most_connections)
             self._server = NodeServer(
                 bind_host, 0, settings.master_uri, self._updated, self._shut_down, self
             )
@@ -238,8 +249,16 @@ class RosNode:
 
     def subscribers(self, topic: str, deadline: Deadline) -> set[str]:
         """Return the nodes that the master lists as subscribers of a topic."""
-        graph = self._call(RosMaster.graph, lambda master: None, deadline, "give the system state")
-        return set(graph.subscribers.get(topic, ()))
+        return set(self.graph(deadline).subscribers.get(topic, ()))
+
+    def graph(self, deadline: Deadline) -> SystemState:
+        """Return the publishers and subscribers of all topics, as the master lists them."""
+        return self._call(RosMaster.graph, lambda master: None, deadline, "give the system state")
+
+    @property
+    def dropped(self) -> int:
+        """Return how many messages subscribers have lost because they were too slow."""
+        return self._topics.dropped
 
     def learn(self, offered: OfferedTopic, deadline: Deadline) -> None:
         """Take over the definition of a type from another publisher of the topic, if there is one.
@@ -279,6 +298,14 @@ class RosNode:
     def flush(self, topic: str, deadline: Deadline) -> set[str]:
         """Wait until all is sent; return the nodes that have not taken theirs."""
         return self._topics.flush(topic, deadline)
+
+    def wait_for_room(self, topic: str, size: int, patience: Patience) -> None:
+        """Wait until subscribers have room for a message, as ``TopicServer`` does."""
+        self._topics.wait_for_room(topic, size, patience)
+
+    def finish(self, patience: Patience) -> None:
+        """Publish nothing more, and wait until subscribers have read all, as ``TopicServer``."""
+        self._topics.finish(patience)
 
     def close(self) -> None:
         """Unregister, unless the master is slow to answer, and close all connections."""

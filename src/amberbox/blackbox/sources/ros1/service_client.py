@@ -42,6 +42,10 @@ class ServiceInfo:
     md5sum: str
 
 
+class ServiceUnreachableError(RosNoAnswerError):
+    """No connection to the address that the master has of a service."""
+
+
 class ServiceFailedError(RosError):
     """A service answered that it failed."""
 
@@ -99,7 +103,7 @@ class _OpenCall:
             sock = socket.create_connection((host, port), min(left_s, settings.timeout_s))
         except (OSError, OverflowError, ValueError) as error:  # as the master gave host and port
             text = getattr(error, "strerror", None) or str(error)
-            raise RosNoAnswerError(f"{name} at {host}:{port}: {text}") from error
+            raise ServiceUnreachableError(f"{name} at {host}:{port}: {text}") from error
         self._sock = sock
         if self._is_over:
             sock.close()

@@ -6,7 +6,7 @@ import hashlib
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -20,6 +20,7 @@ from amberbox.blackbox.sources.ros1.master import (
 from amberbox.blackbox.sources.ros1.tcpros import ENDED, FAILED, PublisherInfo, PublisherLink
 from amberbox.core.errors import did_you_mean
 from amberbox.core.source import Sink
+from amberbox.core.topic_selection import TopicSelection, short_type
 from amberbox.core.types import Topic
 
 MOST_PER_TOPIC = 8
@@ -30,7 +31,7 @@ Table = dict[str, dict[str, str]]
 
 
 class PublisherHistory:
-    """Addresses and digests of latched messages per topic and node, kept across restarts.
+    """Types of topics, addresses and digests of latched messages of nodes, across restarts.
 
     A master that was restarted does not know the publishers that are still running; their last
     known addresses do. The digest distinguishes a repeated delivery from a new message. The port of
@@ -48,12 +49,18 @@ class PublisherHistory:
         self.port = int(state.get("port", 0))
         self._uris: Table = _table(state.get("publishers"))
         self._latched: Table = _table(state.get("latched"))
+        self._types: dict[str, str] = _texts(state.get("types"))
         self._dead: set[str] = set()
 
     def topics(self) -> list[str]:
         """Return the topics with a remembered publisher."""
         with self._lock:
             return [topic for topic, nodes in self._uris.items() if nodes]
+
+    def type_of(self, topic: str) -> str:
+        """Return the type that a topic had; empty if it is not known."""
+        with self._lock:
+            return self._types.get(topic, "")
 
     def nodes(self, topic: str) -> dict[str, str]:
         """Return the remembered publishers of a topic: addresses by node."""
@@ -70,9 +77,12 @@ class PublisherHistory:
         with self._lock:
             return self._uris.get(topic, {}).get(node) == uri
 
-    def remember(self, topic: str, node: str, uri: str) -> None:
-        """Remember the address of a node."""
+    def remember(self, topic: str, node: str, uri: str, kind: str) -> None:
+        """Remember the address of a node, and the type of its topic."""
         with self._lock:
+            if self._types.get(topic) != kind:
+                self._types[topic] = kind
+                self._touch()
             nodes = self._uris.setdefault(topic, {})
             if nodes.pop(node, None) != uri or uri in self._dead:
                 self._touch()
@@ -83,6 +93,7 @@ class PublisherHistory:
                 self._latched.get(topic, {}).pop(oldest, None)
             for long_ago in list(self._uris)[:-MOST_TOPICS]:
                 del self._uris[long_ago]
+                self._types.pop(long_ago, None)
 
     def mark_dead(self, uri: str) -> None:
         """Leave an address where no process listens out of the saved state."""
@@ -154,13 +165,22 @@ class PublisherHistory:
                 for topic, nodes in self._uris.items()
             }
             latched = {topic: dict(nodes) for topic, nodes in self._latched.items()}
-            return {"port": self.port, "publishers": publishers, "latched": latched}
+            return {
+                "port": self.port,
+                "publishers": publishers,
+                "latched": latched,
+                "types": dict(self._types),
+            }
 
 
 def _table(saved: Any) -> Table:
     if not isinstance(saved, dict):
         return {}
-    return {str(t): {str(n): str(v) for n, v in nodes.items()} for t, nodes in saved.items()}
+    return {str(topic): _texts(nodes) for topic, nodes in saved.items()}
+
+
+def _texts(saved: Any) -> dict[str, str]:
+    return {str(k): str(v) for k, v in saved.items()} if isinstance(saved, dict) else {}
 
 
 Deliver = Callable[[bytes, int], None]
@@ -285,10 +305,10 @@ LONGEST_TEXT = 500
 class RosEvents:
     """Emits the events of one run, each once where it repeats; safe to call from any thread."""
 
-    def __init__(self, sink: Sink, configured_types: Mapping[str, str]) -> None:
+    def __init__(self, sink: Sink, selection: TopicSelection) -> None:
         self.failure: Exception | None = None
         self._sink = sink
-        self._configured_types = configured_types
+        self._selection = selection
         self._lock = threading.Lock()
         self._reported: set[tuple[str, ...]] = set()
         self._md5sums: dict[str, str] = {}
@@ -374,7 +394,8 @@ class RosEvents:
 
     def definition(self, topic: str, publisher: PublisherInfo) -> None:
         """Report a type that differs from the configured or the last one, or has no definition."""
-        wanted = self._configured_types.get(topic, "")
+        options = self._selection.options(topic)
+        wanted = short_type(options.type) if options is not None else ""
         if wanted not in ("", "*", publisher.type):
             text = f"{topic} is of type {publisher.type}, configured is {wanted}; recorded as it is"
             self.once(("type", topic, publisher.type), "ros_type_differs", text, topic=topic)
@@ -567,7 +588,7 @@ class TopicSubscription:
             self._silent.discard(link.peer)
             self._sink.link_up(self.topic, link.peer, since_ns)
         is_known = self._memory.knows(self.topic, link.peer, link.uri)
-        self._memory.remember(self.topic, link.peer, link.uri)
+        self._memory.remember(self.topic, link.peer, link.uri, publisher.type)
         self._reports.connected(self.topic, link.uri)
         self._reports.definition(self.topic, publisher)
         topic = publisher.topic(self.topic)

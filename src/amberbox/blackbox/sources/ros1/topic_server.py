@@ -12,9 +12,10 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from amberbox.blackbox.sources.ros1.deadline import Deadline
 from amberbox.blackbox.sources.ros1.master import RosError, TcprosError, global_name, is_global_name
@@ -34,13 +35,17 @@ _LENGTH = struct.Struct("<I")
 
 @dataclass
 class OfferedTopic:
-    """A topic that is served; ``kind`` is None until a subscriber brings the definition."""
+    """A topic that is served; ``kind`` is None until a subscriber brings the definition.
+
+    ``queue`` messages, of ``queue_bytes`` altogether, wait for a slow subscriber at most.
+    """
 
     name: str
     type: str
     kind: MessageType | None = None
     is_latched: bool = False
     queue: int = 10
+    queue_bytes: int = 64 << 20
     last: bytes | None = None
     refused: list[str] = field(default_factory=list)
 
@@ -55,19 +60,53 @@ class _Subscriber:
     topic: OfferedTopic | None = None
     node: str = ""
     waiting: deque[bytes] = field(default_factory=deque)
+    waiting_bytes: int = 0
     begun: memoryview = field(default_factory=lambda: memoryview(b""))
     is_closing: bool = False
+    progress_s: float = 0.0
+    is_ended: bool = False
+    is_hung: bool = False
+    """It was waited for in vain, and has taken nothing since."""
 
     @property
     def is_idle(self) -> bool:
         return not self.waiting and not self.begun
 
+    def is_full(self, size: int = 0) -> bool:
+        """Return whether there is no room for a message of a size."""
+        topic = self.topic
+        return (
+            topic is not None
+            and bool(self.waiting)
+            and (len(self.waiting) >= topic.queue or self.waiting_bytes + size > topic.queue_bytes)
+        )
+
+    def add(self, framed: bytes) -> None:
+        self.waiting.append(framed)
+        self.waiting_bytes += len(framed)
+
+    def take(self) -> bytes:
+        """Remove the message that has waited longest."""
+        framed = self.waiting.popleft()
+        self.waiting_bytes -= len(framed)
+        return framed
+
+
+class Patience(NamedTuple):
+    """How long (s) a subscriber is waited for that takes nothing, unless ``stopped``."""
+
+    seconds: float
+    stopped: Callable[[], bool]
+
 
 class TopicServer:
     """Sends what is published to every subscriber that connects, until ``close``."""
 
-    def __init__(self, bind_host: str, caller_id: str) -> None:
+    def __init__(
+        self, bind_host: str, caller_id: str, most_connections: int = MOST_CONNECTIONS
+    ) -> None:
         self._caller_id = caller_id
+        self._most_connections = most_connections
         self._topics: dict[str, OfferedTopic] = {}
         self._subscribers: set[_Subscriber] = set()
         self._changed = threading.Condition()
@@ -76,7 +115,7 @@ class TopicServer:
         self._listener = socket.create_server((bind_host, 0), backlog=16)
         self.port = int(self._listener.getsockname()[1])
         self.dropped = 0
-        self._is_closed = False
+        self._is_finishing = self._is_closed = False
         for sock in (self._listener, self._woken, self._wake_up):
             sock.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ)
@@ -109,11 +148,51 @@ class TopicServer:
         return len(taking)
 
     def _queue(self, subscriber: _Subscriber, framed: bytes) -> None:
-        assert subscriber.topic is not None
-        while len(subscriber.waiting) >= subscriber.topic.queue:
-            subscriber.waiting.popleft()
+        while subscriber.is_full(len(framed)):
+            subscriber.take()
             self.dropped += 1
-        subscriber.waiting.append(framed)
+        subscriber.add(framed)
+
+    def wait_for_room(self, topic: str, size: int, patience: Patience) -> None:
+        """Wait until all subscribers of a topic have room for a message of a size.
+
+        One that takes nothing for too long is hung: it is not waited for again before it does.
+        """
+
+        def is_late(one: _Subscriber) -> bool:
+            return one.topic is not None and one.topic.name == topic and one.is_full(framed)
+
+        framed = _LENGTH.size + size
+        self._wait_while(is_late, patience)
+
+    def finish(self, patience: Patience) -> None:
+        """Accept nobody any more, send what waits, and wait until subscribers have read all of it.
+
+        A connection ends with the last message; its subscriber closes it once it has read that.
+        Without this, subscribers that hear from the master that the node is gone drop the rest.
+        Messages that hung subscribers have not taken count as dropped.
+        """
+        with self._changed:
+            self._is_finishing = True
+        self._wake()
+        self._wait_while(lambda s: s.topic is not None, patience)
+        with self._changed:
+            self.dropped += sum(len(subscriber.waiting) for subscriber in self._subscribers)
+
+    def _wait_while(self, is_late: Callable[[_Subscriber], bool], patience: Patience) -> None:
+        begun_s = time.monotonic()
+        with self._changed:
+            while late := [s for s in self._subscribers if is_late(s) and not s.is_hung]:
+                self._check()
+                if patience.stopped():
+                    return
+                for subscriber in late:
+                    since_s = max(begun_s, subscriber.progress_s)
+                    subscriber.is_hung = time.monotonic() - since_s > patience.seconds
+                self._changed.wait(0.02)
+
+    def _of(self, topic: str) -> Iterator[_Subscriber]:
+        return (s for s in self._subscribers if s.topic is not None and s.topic.name == topic)
 
     def nodes(self, topic: str) -> set[str]:
         """Return the names of the nodes that are connected to a topic."""
@@ -122,7 +201,7 @@ class TopicServer:
             return self._nodes(topic)
 
     def _nodes(self, topic: str) -> set[str]:
-        return {s.node for s in self._subscribers if s.topic is not None and s.topic.name == topic}
+        return {s.node for s in self._of(topic)}
 
     def wait_for(self, topic: str, nodes: set[str], count: int, deadline: Deadline) -> set[str]:
         """Wait for all of these nodes, and so many in all; return those that are connected.
@@ -200,7 +279,7 @@ class TopicServer:
         except OSError:  # the peer is gone again, or no file descriptor is free
             time.sleep(0.01)
             return
-        if len(self._subscribers) >= MOST_CONNECTIONS:
+        if self._is_finishing or len(self._subscribers) >= self._most_connections:
             sock.close()
             return
         sock.setblocking(False)
@@ -266,7 +345,7 @@ class TopicServer:
         }
         subscriber.begun = memoryview(encode_header(answer))
         if offered.last is not None:
-            subscriber.waiting.append(offered.last)
+            subscriber.add(offered.last)
         subscriber.received.clear()
         subscriber.topic = offered
         self._changed.notify_all()
@@ -297,16 +376,28 @@ class TopicServer:
         with self._changed:
             for subscriber in list(self._subscribers):
                 self._send(subscriber)
+                if self._is_finishing:
+                    self._end(subscriber)
+
+    def _end(self, subscriber: _Subscriber) -> None:
+        """Tell a subscriber that has been sent everything that nothing follows."""
+        if subscriber.topic is None:
+            self._close(subscriber)
+        elif subscriber.is_idle and not subscriber.is_ended and subscriber in self._subscribers:
+            subscriber.is_ended, subscriber.progress_s = True, time.monotonic()
+            with suppress(OSError):
+                subscriber.sock.shutdown(socket.SHUT_WR)
 
     def _send(self, subscriber: _Subscriber) -> None:
         """Send what the socket takes; wait for the socket if something is left."""
-        was_idle = subscriber.is_idle
+        was_idle, waited = subscriber.is_idle, len(subscriber.waiting)
         try:
             while not subscriber.is_idle:
                 if not subscriber.begun:
-                    subscriber.begun = memoryview(subscriber.waiting.popleft())
+                    subscriber.begun = memoryview(subscriber.take())
                 sent = subscriber.sock.send(subscriber.begun)
                 subscriber.begun = subscriber.begun[sent:]
+                subscriber.progress_s, subscriber.is_hung = time.monotonic(), False
         except BlockingIOError:
             pass
         except OSError:
@@ -315,7 +406,7 @@ class TopicServer:
         if subscriber.is_idle and subscriber.is_closing:
             self._close(subscriber)
             return
-        if subscriber.is_idle and not was_idle:
+        if (subscriber.is_idle and not was_idle) or len(subscriber.waiting) < waited:
             self._changed.notify_all()
         wanted = selectors.EVENT_READ | (0 if subscriber.is_idle else selectors.EVENT_WRITE)
         if self._selector.get_key(subscriber.sock).events != wanted:

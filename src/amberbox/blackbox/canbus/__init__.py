@@ -1,0 +1,1 @@
+"""CAN: frames and what their bytes mean, for the live source and for logs of other tools."""

@@ -1,0 +1,1 @@
+"""What sources share whose payloads come without a definition."""

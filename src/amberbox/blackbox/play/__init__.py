@@ -1,0 +1,1 @@
+"""Play recorded messages to peers: the pace, and one file for each kind of peer."""

@@ -1,0 +1,1 @@
+"""ZRE, the protocol of Zyre: beacons, messages, and a node that listens."""
