@@ -23,13 +23,15 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
 import msgspec
 
+from amberbox.agent.unit_test_action import is_unit_test, load_unit_test
+from amberbox.core.command import MODEL_INSTALL
 from amberbox.core.errors import AmberboxError, NotStartedError, UsageError
 from amberbox.core.safe_text import one_line
 from amberbox.experiments.action import DeclaredAction, Value, check_parameters, load_action
@@ -226,7 +228,7 @@ class Actor:
         return _done(function(action.config, Context(self._values, self._stop, self._pipes)))
 
     def _load(self) -> None:
-        action = load_action(Path(self._task.folder), self._task.action)
+        action = _loader(self._task.action)(Path(self._task.folder), self._task.action)
         if self._task.simulated and not action.has("simulated"):
             raise UsageError(f"{action.name} has no simulated twin", "declare 'simulated:' for it")
         self._values = check_parameters(action, self._task.parameters)
@@ -382,6 +384,15 @@ def exit_with(ended: Ended, pipes: Pipes) -> NoReturn:
     state = State(ended.state, ended.reason, ended.hint, ended.result)
     pipes.put(state, within_s=_WRITE_S)
     os._exit(0)
+
+
+def _loader(action: str) -> Callable[[Path, str], DeclaredAction]:
+    """Return what loads an action: declared in the robot folder, a unit test, or built in."""
+    if action == MODEL_INSTALL:
+        from amberbox.agent.model_action import load_install  # others start without it
+
+        return load_install
+    return load_unit_test if is_unit_test(action) else load_action
 
 
 def describe(error: BaseException) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ import msgspec
 
 from amberbox.agent.actor import COMMAND, Ended, EndState, State, Task, boot_s, with_trouble
 from amberbox.core.errors import UsageError
+from amberbox.core.files import wait_readable
 from amberbox.core.safe_text import one_line
 from amberbox.experiments.action import LONGEST_STOP_S
 
@@ -98,7 +98,7 @@ class SupervisedActor:
 
     def wait(self, seconds: float) -> Outcome | None:
         """Wait until the actor has something new, or so long; return the outcome, if any."""
-        select.select(self.filenos(), [], [], seconds)
+        wait_readable(self.filenos(), seconds)
         return self.step()
 
     def step(self) -> Outcome | None:
@@ -232,7 +232,7 @@ class ActorProcess:
 
     def is_gone(self) -> bool:
         """Return whether the process has ended."""
-        return bool(select.select([self._watched], [], [], 0)[0])
+        return bool(wait_readable([self._watched], 0))
 
     def states(self) -> list[State]:
         """Return what it has said since the last call; what it prints is read as well."""

@@ -1,5 +1,8 @@
 """The robot's decision whether a command runs: checks, lease, confirmation on site, revocation.
 
+Orders that come from the robot itself, of somebody who stands at it or of its recovery policy, are
+not signed. Everything else holds for them as for the commands of a server.
+
 A state machine without threads and without input or output of its own: clock, log, trust file,
 actions and randomness are handed in. Times are those of CLOCK_BOOTTIME, so that no step of the wall
 clock makes a late command young. Every method works off what is due first. Those that return a
@@ -30,9 +33,12 @@ from amberbox.core.command import (
     CommandAnswer,
     CommandError,
     LeaseState,
+    OrderLimit,
     Risk,
     decode_command,
+    encode_command,
     is_command_id,
+    unread_id,
     verify_command,
 )
 from amberbox.core.errors import AmberboxError, ConfigurationError
@@ -51,6 +57,9 @@ _REMEMBERED = 1000
 _MOST_REVOKED = 10_000
 _KEY_ID_DIGITS = 16
 
+# The reason of an answer that is repeated
+CAME_AGAIN = "came again"
+
 DecisionKind = Literal["run", "ask", "answer", "stop", "note"]
 
 
@@ -60,9 +69,9 @@ class Decision:
 
     ``run``: start the action of ``command`` now; that it was accepted is on the disk. ``ask``: show
     ``code`` at the robot, or where it is empty wait for the button, to confirm ``command``.
-    ``answer``: send ``answer`` to the server. ``stop``: stop the running command ``id`` safely.
-    ``note``: only record ``text``. ``text`` is the reason; ``person`` is whose key signed, while
-    the command's ``issuer`` is only what the server states.
+    ``answer``: send ``answer`` to the server, unless it ``is_local``. ``stop``: stop the running
+    command ``id`` safely. ``note``: only record ``text``. ``text`` is the reason; ``person`` is
+    whose key signed, while the command's ``issuer`` is only what the server states.
     """
 
     kind: DecisionKind
@@ -72,6 +81,16 @@ class Decision:
     answer: CommandAnswer | None = None
     code: str = ""
     person: str = ""
+    is_local: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingState:
+    """A motion that waits: its command, whether by a code, and how many wrong ones came."""
+
+    id: str
+    by_code: bool
+    tries: int
 
 
 class CommandLog(Protocol):
@@ -94,7 +113,13 @@ class CommandLog(Protocol):
     def unanswered(self) -> list[CommandAnswer]:
         """Return the answers that the server has not stored yet."""
 
-    def add(self, answer: CommandAnswer, digest: str, /) -> CommandAnswer:
+    def origin(self, command_id: str, /) -> str:
+        """Return where an order of this robot itself came from; empty for any other command."""
+
+    def attempts(self, origin: str, /) -> list[CommandAnswer]:
+        """Return the newest answer of each order of an origin that was accepted."""
+
+    def add(self, answer: CommandAnswer, digest: str, origin: str = "", /) -> CommandAnswer:
         """Store an answer durably; return it with its number."""
 
     def add_lease(self, number: int, /) -> None:
@@ -157,10 +182,13 @@ class _Waiting:
 
 @dataclass(slots=True)
 class _Lease:
+    """``order`` is the order of this robot itself that took it, and alone uses it."""
+
     number: int
     holder: str
     run: str
     renewed_ns: int
+    order: str = ""
     keys: set[str] = field(default_factory=set)
 
 
@@ -185,9 +213,9 @@ class CommandGate:
         self._lease: _Lease | None = None
         self._waiting: _Waiting | None = None
         self._running: dict[str, _Running] = {}
-        self._refused: dict[str, tuple[str, CommandAnswer]] = {}
-        # what the disk did not take yet
-        self._ends: dict[str, tuple[str, CommandAnswer]] = {}
+        # what the disk did not take yet; refusals with their origin
+        self._refused: dict[str, tuple[str, CommandAnswer, str]] = {}
+        self._ends: dict[str, tuple[str, CommandAnswer, str]] = {}
         self._revoked: set[str] = set()
         self._out: list[Decision] = []
 
@@ -195,7 +223,7 @@ class CommandGate:
         """Begin: the outcome of what was accepted earlier and has no end is unknown."""
         why = "the robot's command process ended while this was carried out"
         for digest, answer in self._log.running():
-            self._ends[answer.id] = digest, self._answer(answer.id, "outcome_unknown", why)
+            self._ends[answer.id] = digest, self._answer(answer.id, "outcome_unknown", why), ""
         return self.step()
 
     def step(self) -> list[Decision]:
@@ -222,8 +250,8 @@ class CommandGate:
                 self._log.add_revoked(self._revoked)
                 self._revoked = set()
             for waiting in (self._ends, self._refused):
-                for command_id, (digest, answer) in list(waiting.items()):
-                    stored = self._log.add(answer, digest)
+                for command_id, (digest, answer, origin) in list(waiting.items()):
+                    stored = self._log.add(answer, digest, origin)
                     del waiting[command_id]
                     self._say(stored)
         except CommandLogError:
@@ -249,19 +277,19 @@ class CommandGate:
         return self.step()
 
     def _decide(self, raw: bytes) -> None:
+        digest = hashlib.sha256(raw).hexdigest()
         try:
             command = decode_command(raw)
         except CommandError as error:
-            self._note(f"a command was refused: {error.what}")
+            self._refuse_unread(unread_id(raw), digest, error.what)
             return
-        digest = hashlib.sha256(raw).hexdigest()
         if command.robot != self._robot:
             why = f"it is for the robot {command.robot}, and this one is {self._robot}"
             self._say(self._answer(command.id, "refused", why))
             return
         known = self._known(command.id)
         if known is not None:
-            self._repeat(command, digest, *known)
+            self._repeat(command.id, digest, *known)
             return
         why, signer = self._problem(command)
         if why:
@@ -271,22 +299,33 @@ class CommandGate:
         else:
             self._accept(command, digest, signer.name)
 
+    def _refuse_unread(self, command_id: str, digest: str, why: str) -> None:
+        """Answer what cannot be read, if it names an id, so that it is not sent again for ever."""
+        known = self._known(command_id) if command_id else None
+        if not command_id:
+            self._note(f"a command was refused: {why}"[:REASON_LENGTH])
+        elif known is None:
+            self._say(self._answer(command_id, "refused", f"it cannot be read: {why}"))
+        else:
+            self._repeat(command_id, digest, *known)
+
     def _known(self, command_id: str) -> tuple[str, CommandAnswer | None] | None:
         """Return digest and answer of a command that came before; no answer while it waits."""
         if self._waiting is not None and self._waiting.command.id == command_id:
             return self._waiting.digest, None
-        return self._refused.get(command_id) or self._log.seen(command_id)
+        refused = self._refused.get(command_id)
+        return refused[:2] if refused is not None else self._log.seen(command_id)
 
     def _repeat(
-        self, command: Command, digest: str, known: str, answer: CommandAnswer | None
+        self, command_id: str, digest: str, known: str, answer: CommandAnswer | None
     ) -> None:
         if digest != known and known:
             why = "a command with this id and other content came before"
-            self._say(self._answer(command.id, "refused", why))
+            self._say(self._answer(command_id, "refused", why))
         elif answer is None:
-            self._note("came again, and still waits for its confirmation", command.id)
+            self._note("came again, and still waits for its confirmation", command_id)
         else:
-            self._say(answer, "came again")
+            self._say(answer, CAME_AGAIN)
 
     def _problem(self, command: Command) -> tuple[str, _Signer]:
         """Return why a command is refused (empty if it is not), and who signed it."""
@@ -360,7 +399,8 @@ class CommandGate:
         lease = self._lease
         if lease is None:
             return "no run holds the lease of this robot"
-        if lease.number != command.signature.lease or lease.run != command.run:
+        given = lease.number, lease.run
+        if lease.order or given != (command.signature.lease, command.run):
             return f"the lease of this robot is held by {_holder(lease)}"
         return ""
 
@@ -377,12 +417,12 @@ class CommandGate:
         if self._lease is not None and command.signature is not None:
             self._lease.keys.add(command.signature.key_id)
 
-    def _accept(self, command: Command, digest: str, person: str) -> None:
+    def _accept(self, command: Command, digest: str, person: str, origin: str = "") -> None:
         """Store that a command is accepted, and only then let it run."""
         try:
-            stored = self._log.add(self._answer(command.id, "accepted"), digest)
+            stored = self._log.add(self._answer(command.id, "accepted"), digest, origin)
         except CommandLogError as error:
-            self._conclude(command.id, digest, "refused", error.what, person)
+            self._conclude(command.id, digest, "refused", error.what, person, origin)
             return
         if command.signature is not None:
             self._challenges[command.signature.challenge].used.add(command.id)
@@ -392,14 +432,15 @@ class CommandGate:
         self._out.append(Decision("run", command.id, "", command, person=person))
 
     def _conclude(
-        self, command_id: str, digest: str, state: AnswerState, why: str, person: str = ""
-    ) -> None:
+        self, command_id: str, digest: str, state: AnswerState, why: str, person: str = "",
+        origin: str = "",
+    ) -> None:  # fmt: skip
         """Answer a command that does not run."""
         answer = self._answer(command_id, state, why)
         try:
-            answer = self._log.add(answer, digest)
+            answer = self._log.add(answer, digest, origin)
         except CommandLogError:
-            self._refused[command_id] = digest, answer
+            self._refused[command_id] = digest, answer, origin
             _keep_newest(self._refused)
         self._say(answer, person=person)
 
@@ -419,21 +460,103 @@ class CommandGate:
             if len(result.encode("utf-8", "replace")) > RESULT_BYTES:
                 result, reason = "", f"{reason} (its result was too large)".strip()
             answer = self._answer(command_id, state, reason, result)
-            self._ends[command_id] = running.digest, answer
+            self._ends[command_id] = running.digest, answer, ""
+            if self._is_leased_to(command_id):
+                self._end_lease("its order has ended")
         return self.step()
+
+    # -- orders of this robot itself
+
+    def order(
+        self, command_id: str, action: str, parameters: str, who: str, *,
+        is_confirmed: bool = False, rule: str = "", limit: OrderLimit | None = None,
+    ) -> list[Decision]:  # fmt: skip
+        """Decide about an order of somebody at the robot, or of a ``rule`` of its policy.
+
+        It takes the lease as ``who``, for as long as it runs; ``renew_order`` keeps it.
+        ``is_confirmed``: the person who ordered a motion stands at the robot and sees that its way
+        is free. A rule never moves anything, and orders at most as often as its ``limit``.
+        """
+        self._settle()
+        risk = self._actions.risk(action)
+        command = Command(command_id, self._robot, action, parameters, who, risk or "state")
+        try:
+            raw = encode_command(command)
+        except CommandError as error:
+            self._note(f"refused: {error.what}"[:REASON_LENGTH], command_id)
+            return self.step()
+        digest, origin = hashlib.sha256(raw).hexdigest(), _origin(rule)
+        known = self._known(command_id)
+        if known is not None:
+            self._repeat(command_id, digest, *known)
+            return self.step()
+        why = self._content_problem(command) or self._order_problem(command, rule, limit)
+        if risk == "moves" and not (is_confirmed or why):
+            why = f"{action} moves the robot, and was not confirmed at the robot"
+        if not why and risk != "record":
+            why = self._give_lease(who, "", command_id)
+        if why:
+            self._conclude(command_id, digest, "refused", why[:REASON_LENGTH], who, origin)
+        else:
+            self._accept(command, digest, who, origin)
+            if command_id not in self._running and self._is_leased_to(command_id):
+                self._end_lease("its order was refused")
+        return self.step()
+
+    def _order_problem(self, command: Command, rule: str, limit: OrderLimit | None) -> str:
+        """Return why the policy may not order this; empty for a person."""
+        if not rule:
+            return ""
+        if command.risk == "moves":
+            return f"{command.action} moves the robot: only a person may order that"
+        if limit is None or self.attempts(rule, limit.per_s) >= limit.most:
+            return "it was ordered as often as its rule allows"
+        return ""
+
+    def order_obstacle(self) -> str:
+        """Return why no order of this robot itself is possible now; empty if it is free."""
+        self._settle()
+        return self._take_problem("the robot itself", "", "order")
+
+    def attempts(self, rule: str, within_s: float) -> int:
+        """Return how many orders of a rule were accepted in the last seconds (``OrderLimit``)."""
+        now_ns, boot = self._clock.boot_ns(), self._clock.boot_id()
+        ages_ns = (
+            now_ns - (answer.mono_ns if answer.boot == boot else 0)
+            for answer in self._log.attempts(_origin(rule))
+        )
+        return sum(age_ns <= within_s * NS for age_ns in ages_ns)
+
+    def renew_order(self, command_id: str) -> bool:
+        """Renew the lease that an order has taken; return whether it has it still."""
+        self._settle()
+        if self._lease is None or not self._is_leased_to(command_id):
+            return False
+        self._lease.renewed_ns = self._clock.boot_ns()
+        return True
+
+    def _is_leased_to(self, command_id: str) -> bool:
+        return self._lease is not None and self._lease.order == command_id
 
     # -- confirmation on site
 
-    def confirmed(self, code: str = "", *, on_site: bool = False) -> list[Decision]:
-        """Take a confirmation of the motion that waits.
+    def waiting(self) -> WaitingState | None:
+        """Return which motion waits for its confirmation."""
+        one = self._waiting
+        return None if one is None else WaitingState(one.command.id, bool(one.code), one.tries)
+
+    def confirmed(
+        self, code: str = "", command: str = "", *, on_site: bool = False
+    ) -> list[Decision]:
+        """Take a confirmation of the motion that waits; with an id only if it is this one.
 
         ``on_site``: given at the robot, by its button or ``amberbox confirm``, which needs no code.
         From elsewhere only the code that is shown at the robot counts.
         """
         self._settle()
         waiting = self._waiting
-        if waiting is None:
-            self._note("confirmed, but no command waits for it")
+        if waiting is None or command not in ("", waiting.command.id):
+            self._note("confirmed, but it does not wait for a confirmation", command)
         elif on_site or _is_code(code, waiting.code):
             self._waiting = None
             self._accept_confirmed(waiting)
@@ -487,24 +610,29 @@ class CommandGate:
         The same holder and run get the lease that they have, which is not renewed by that.
         """
         self._settle()
-        wrong = self._take_problem(holder, run)
+        wrong = self._give_lease(holder, run)
+        what = f"not given to {_name(holder, run)}: {wrong}" if wrong else "given"
+        self._note(f"lease {self._log.lease_number} {what}")
+        return self._lease_state(wrong)
+
+    def _give_lease(self, holder: str, run: str, order: str = "") -> str:
+        """Give the lease, unless it is given already; return why it was not."""
+        wrong = self._take_problem(holder, run, order)
         if not wrong and self._lease is None:
             number = self._log.lease_number + 1
             try:
                 self._log.add_lease(number)
             except CommandLogError as error:
-                wrong = error.what
-            else:
-                self._lease = _Lease(number, holder, run, self._clock.boot_ns())
-        what = f"not given to {_name(holder, run)}: {wrong}" if wrong else "given"
-        self._note(f"lease {self._log.lease_number} {what}")
-        return self._lease_state(wrong)
+                return error.what
+            self._lease = _Lease(number, holder, run, self._clock.boot_ns(), order)
+        return wrong
 
-    def _take_problem(self, holder: str, run: str) -> str:
+    def _take_problem(self, holder: str, run: str, order: str) -> str:
         if not _is_label(holder) or (run and not _is_label(run)):
             return "the holder of a lease has a name of at most 128 printable characters"
         lease = self._lease
-        if lease is not None and (lease.holder, lease.run) != (holder, run):
+        is_own = lease is not None and not (lease.order or order)
+        if lease is not None and not (is_own and (lease.holder, lease.run) == (holder, run)):
             return f"the lease of this robot is held by {_holder(lease)}"
         signed = [r for r in self._running.values() if r.command.risk != "record"]
         if lease is None and signed:
@@ -514,7 +642,7 @@ class CommandGate:
     def renew(self, number: int) -> LeaseState:
         """Renew a lease, each second; the state has a reason where it is lost."""
         self._settle()
-        if self._lease is None or self._lease.number != number:
+        if self._lease is None or self._lease.number != number or self._lease.order:
             return self._lease_state(f"lease {number} is lost")
         self._lease.renewed_ns = self._clock.boot_ns()
         return self._lease_state()
@@ -522,7 +650,8 @@ class CommandGate:
     def release(self, number: int) -> list[Decision]:
         """End a lease; what runs under it is stopped."""
         self._settle()
-        if self._lease is not None and self._lease.number == number:
+        lease = self._lease
+        if lease is not None and lease.number == number and not lease.order:
             self._end_lease("released")
         return self.step()
 
@@ -531,6 +660,8 @@ class CommandGate:
         lease, self._lease = self._lease, None
         if lease is None:
             return
+        if lease.order not in self._running and lease.order:
+            return  # with its order, of which the record has everything
         reason = f"lease {lease.number} of {_holder(lease)} ended: {why}"
         self._note(reason)
         self._refuse_waiting(reason)
@@ -612,11 +743,19 @@ class CommandGate:
         )  # fmt: skip
 
     def _say(self, answer: CommandAnswer, text: str = "", person: str = "") -> None:
-        why = text or answer.reason
-        self._out.append(Decision("answer", answer.id, why, answer=answer, person=person))
+        refused = self._refused.get(answer.id)
+        is_local = bool(refused[2] if refused is not None else self._log.origin(answer.id))
+        self._out.append(
+            Decision("answer", answer.id, text or answer.reason, answer=answer, person=person,
+                     is_local=is_local)
+        )  # fmt: skip
 
     def _note(self, text: str, command_id: str = "") -> None:
         self._out.append(Decision("note", command_id, text))
+
+
+def _origin(rule: str) -> str:
+    return f"policy {rule}" if rule else "site"
 
 
 def _is_young(now_ns: int, challenge: _Challenge, ttl_s: int) -> bool:

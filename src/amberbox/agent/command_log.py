@@ -3,7 +3,8 @@
 One record a line, ``CRC JSON``: answers (``accepted`` is one), lease numbers, revocations, and how
 far the server has stored the answers. What was appended is synced before ``add`` returns, so an
 ``accepted`` without an end was being carried out when the process or the power went. The newest
-100,000 ids are remembered, so that no command runs twice.
+100,000 ids are remembered, so that no command runs twice. Answers to orders that came from this
+robot itself carry their ``origin``; no server waits for them.
 
 The file is replaced at opening, after a failure, and when most of it is no longer needed: the new
 one is complete and synced before it takes the name, so that a power cut leaves the old or the new
@@ -22,13 +23,15 @@ from typing import Protocol
 import msgspec
 from msgspec import Struct
 
-from amberbox.core.command import FINAL, CommandAnswer
+from amberbox.core.command import FINAL, MOST_ORDERS, CommandAnswer
 from amberbox.core.errors import AmberboxError
 
 MOST_IDS = 100_000
 # Results of so many answers are kept until the server has them
 RESULTS = 200
 TIDY_BYTES = 1 << 20
+# Orders of so many rules of recovery are counted, and of each the newest
+MOST_RULES = 200
 _NUMBERS_LOST = 1000  # a damaged line may have held higher numbers than those that can be read
 _BLOCK = 1 << 20
 
@@ -52,6 +55,7 @@ class FileSystem(Protocol):
 class _Answer(Struct, frozen=True, tag="answer"):
     digest: str
     answer: CommandAnswer
+    origin: str = ""
 
 
 class _Lease(Struct, frozen=True, tag="lease"):
@@ -105,6 +109,8 @@ class CommandLogFile:
         self._running: dict[str, CommandAnswer] = {}
         self._unanswered: dict[str, CommandAnswer] = {}
         self._results: dict[str, None] = {}
+        # of each origin the ids of its orders that were accepted, oldest first
+        self._attempts: dict[str, dict[str, None]] = {}
         # whether all of the file is on the disk; else it is replaced before the next record
         self._is_sound = False
         self._size = self._replaced_size = 0
@@ -158,6 +164,16 @@ class CommandLogFile:
         found = _ANSWERS.decode(known)
         return found.digest, self._unanswered.get(command_id, found.answer)
 
+    def origin(self, command_id: str) -> str:
+        """Return where an order of this robot itself came from; empty for any other command."""
+        known = self._seen.get(command_id)
+        return "" if known is None else _ANSWERS.decode(known).origin
+
+    def attempts(self, origin: str) -> list[CommandAnswer]:
+        """Return the newest answer of each order of an origin that was accepted, oldest first."""
+        found = map(self.seen, self._attempts.get(origin, ()))
+        return [known[1] for known in found if known is not None]
+
     def running(self) -> list[tuple[str, CommandAnswer]]:
         """Return digest and answer of each command that was accepted and has not ended."""
         return [found for found in map(self.seen, self._running) if found is not None]
@@ -168,13 +184,14 @@ class CommandLogFile:
 
     # -- what is added
 
-    def add(self, answer: CommandAnswer, digest: str) -> CommandAnswer:
+    def add(self, answer: CommandAnswer, digest: str, origin: str = "") -> CommandAnswer:
         """Store an answer under the next number, and return it once it survives a power cut.
 
-        Raises CommandLogError, and then it does not count.
+        ``origin`` is that of an order of this robot itself; later answers to it keep it. Raises
+        CommandLogError, and then it does not count.
         """
         numbered = msgspec.structs.replace(answer, number=self._answers + 1)
-        self._append(_Answer(digest, numbered))
+        self._append(_Answer(digest, numbered, origin or self.origin(answer.id)))
         return numbered
 
     def add_lease(self, number: int) -> None:
@@ -214,7 +231,7 @@ class CommandLogFile:
     def _apply(self, record: _Record) -> None:
         match record:
             case _Answer():
-                self._apply_answer(record.digest, record.answer)
+                self._apply_answer(record)
             case _Lease(number):
                 self.lease_number = max(self.lease_number, number)
             case _Revoked(keys):
@@ -229,15 +246,18 @@ class CommandLogFile:
                 self._acknowledged = max(self._acknowledged, record.acknowledged)
                 self.lease_number = max(self.lease_number, record.lease)
 
-    def _apply_answer(self, digest: str, answer: CommandAnswer) -> None:
+    def _apply_answer(self, record: _Answer) -> None:
+        answer = record.answer
         self._answers = max(self._answers, answer.number)
         bare = msgspec.structs.replace(answer, result="")
-        self._seen[answer.id] = msgspec.json.encode(_Answer(digest, bare))
+        self._seen[answer.id] = msgspec.json.encode(msgspec.structs.replace(record, answer=bare))
         if answer.state in FINAL:
             self._running.pop(answer.id, None)
         else:
             self._running[answer.id] = bare
-        if answer.number > self._acknowledged:
+        if record.origin:
+            self._count_attempt(record.origin, answer)
+        elif answer.number > self._acknowledged:
             self._unanswered[answer.id] = answer
             if answer.result:
                 self._results[answer.id] = None
@@ -249,9 +269,23 @@ class CommandLogFile:
         while len(self._seen) > self._most and self._forget_oldest():
             pass
 
+    def _count_attempt(self, origin: str, answer: CommandAnswer) -> None:
+        if answer.state == "refused":
+            return
+        ids = self._attempts.setdefault(origin, {})
+        ids[answer.id] = None
+        if len(ids) > MOST_ORDERS:
+            del ids[next(iter(ids))]
+        if len(self._attempts) > MOST_RULES:
+            del self._attempts[next(iter(self._attempts))]
+
     def _forget_oldest(self) -> bool:
-        """Forget the oldest id whose command is not running; return whether there was one."""
-        oldest = next((known for known in self._seen if known not in self._running), None)
+        """Forget the oldest id that is no longer needed; return whether there was one.
+
+        Needed are commands that run, and orders that count against a limit.
+        """
+        kept = {*self._running, *(one for ids in self._attempts.values() for one in ids)}
+        oldest = next((known for known in self._seen if known not in kept), None)
         if oldest is None:
             return False
         del self._seen[oldest]
@@ -303,7 +337,8 @@ class CommandLogFile:
             yield _Revoked(sorted(self._revoked))
         for command_id, known in self._seen.items():
             found = _ANSWERS.decode(known)
-            yield _Answer(found.digest, self._unanswered.get(command_id, found.answer))
+            answer = self._unanswered.get(command_id, found.answer)
+            yield _Answer(found.digest, answer, found.origin)
 
     def close(self) -> None:
         """Close the file."""

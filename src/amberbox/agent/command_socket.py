@@ -2,7 +2,8 @@
 
 A Unix socket in the store, for processes of the same user and of root. The link process passes the
 frames of the server through it and gets those for the server; ``amberbox confirm`` asks what waits
-for a confirmation, and gives it. A message is its length, 4 bytes big-endian, and MessagePack.
+for a confirmation, and gives it; ``amberbox action run`` orders an action. A message is its length,
+4 bytes big-endian, and MessagePack.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import msgspec
 from msgspec import Struct
 
-from amberbox.core.command import CommandAnswer, LeaseState
+from amberbox.core.command import CommandAnswer, CommandId, LeaseState, new_command_id
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import wait_readable
 from amberbox.link import limits
 from amberbox.link.command_port import (
     ActionAnnouncement,
@@ -29,11 +31,22 @@ from amberbox.link.command_port import (
     GateReport,
     MintedChallenge,
 )
-from amberbox.link.frames import AbortFrame, AnsweredFrame, CommandsFrame, LeaseFrame, RevokedFrame
+from amberbox.link.frames import (
+    AbortFrame,
+    AnsweredFrame,
+    CommandsFrame,
+    ConfirmFrame,
+    LeaseFrame,
+    RevokedFrame,
+)
 
 SOCKET = "commands.sock"
 _MOST_BYTES = 4 << 20
 _READ = 1 << 16
+# Read from one process before the others have their turn
+_MOST_READ = 1 << 20
+# Reports that wait for the server; with more of them the command process is connected anew
+_MOST_REPORTS = 2000
 _AGAIN_S = 0.5
 _SEND_S = 2.0
 _CREDENTIALS = struct.Struct("3i")
@@ -67,11 +80,34 @@ class SiteAsks(Struct, frozen=True, tag="ask"):
     """Somebody at the robot asks for ``SiteState``."""
 
 
+class SiteOrders(Struct, frozen=True, tag="order"):
+    """Somebody at the robot orders an action; ``parameters`` is the JSON text of an object.
+
+    The connection has to renew it, once a second, and gets its reports and its outcome.
+    ``confirmed``: whoever ordered a motion sees that its way is free.
+    """
+
+    id: CommandId
+    action: str
+    parameters: str = "{}"
+    who: str = ""
+    confirmed: bool = False
+
+
+class SiteRenews(Struct, frozen=True, tag="renew"):
+    """Somebody at the robot still wants what they have ordered."""
+
+    id: CommandId
+
+
 class Challenge(Struct, frozen=True, tag="challenge"):
-    """A challenge for signatures, and who holds the robot."""
+    """A challenge for signatures, who holds the robot, and which motion waits."""
 
     challenge: bytes
     lease: LeaseState
+    waiting: str = ""
+    by_code: bool = False
+    tries: int = 0
 
 
 class Announcement(Struct, frozen=True, tag="actions"):
@@ -107,6 +143,24 @@ class RunningAction(Struct, frozen=True):
     report: str = ""
 
 
+class OrderReport(Struct, frozen=True, tag="report"):
+    """What an ordered action reports."""
+
+    id: str
+    text: str
+
+
+class OrderOutcome(Struct, frozen=True, tag="outcome"):
+    """How an order has ended, or why it was refused; ``result`` is JSON text of an object."""
+
+    id: str
+    state: str
+    reason: str = ""
+    hint: str = ""
+    result: str = ""
+    printed: str = ""
+
+
 class SiteState(Struct, frozen=True, tag="state"):
     """What concerns commands at the robot now."""
 
@@ -118,9 +172,11 @@ class SiteState(Struct, frozen=True, tag="state"):
 
 ToGate: TypeAlias = (
     LinkBegins | LinkEnds | CommandsFrame | AnsweredFrame | RevokedFrame | LeaseFrame | AbortFrame
-    | SiteConfirms | SiteAborts | SiteAsks
+    | ConfirmFrame | SiteConfirms | SiteAborts | SiteAsks | SiteOrders | SiteRenews
 )  # fmt: skip
-FromGate: TypeAlias = Challenge | Announcement | Answers | SiteState
+FromGate: TypeAlias = (
+    Challenge | Announcement | Answers | SiteState | OrderReport | OrderOutcome
+)  # fmt: skip
 
 _ENCODER = msgspec.msgpack.Encoder()
 _TO_GATE: msgspec.msgpack.Decoder[ToGate] = msgspec.msgpack.Decoder(ToGate)
@@ -183,7 +239,8 @@ class SocketServer:
 
     def filenos(self) -> list[int]:
         """Return the file descriptors to wait for."""
-        return [self._listener.fileno(), *(client.fileno() for client in self.clients)]
+        there = (client for client in self.clients if not client.is_closed)
+        return [self._listener.fileno(), *(client.fileno() for client in there)]
 
     def received(self) -> list[tuple[SocketClient, ToGate]]:
         """Accept who came; return all messages that can be read now, with their senders."""
@@ -228,18 +285,23 @@ class SocketClient:
         return self._socket.fileno()
 
     def received(self) -> list[ToGate]:
-        """Return the messages that can be read now; close it at its end or for bad data."""
+        """Return messages that can be read now, a megabyte of them; close it at its end or for bad
+        data.
+        """
         found: list[ToGate] = []
+        size = 0
         try:
-            while not self.is_closed:
+            while not self.is_closed and size < _MOST_READ:
                 data = self._socket.recv(_READ)
+                size += len(data)
                 if not data:
                     self.close()
                 found += map(_TO_GATE.decode, self._buffer.feed(data))
         except BlockingIOError:
-            self._flush()
+            pass
         except (OSError, ValueError, msgspec.MsgspecError):
             self.close()
+        self._flush()
         return found
 
     def send(self, message: FromGate) -> None:
@@ -264,8 +326,19 @@ class SocketClient:
         self._socket.close()
 
 
+def orders_at(folder: Path) -> Path | None:
+    """Return the store of a robot folder whose command process takes orders; None without one."""
+    # other ends of the socket begin without them
+    from amberbox.blackbox.robot_folder.folder import store_of
+    from amberbox.blackbox.store.store import is_locked, is_store, open_store
+
+    store = store_of(folder)
+    is_taken = store is not None and is_store(store) and is_locked(open_store(store), "act")
+    return store if is_taken else None
+
+
 class SiteConnection:
-    """The end of ``amberbox confirm``; raises AmberboxError where no command process answers."""
+    """The end of a person at the robot; raises AmberboxError where no command process answers."""
 
     def __init__(self, store: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
@@ -283,24 +356,81 @@ class SiteConnection:
 
     def ask(self, message: SiteConfirms | SiteAborts | SiteAsks) -> SiteState:
         """Send a message; return what holds after it."""
+        self.send(message)
+        end_s = time.monotonic() + _SEND_S
+        while time.monotonic() < end_s:
+            for found in self.received(_SEND_S):
+                if isinstance(found, SiteState):
+                    return found
+        raise AmberboxError("the command process does not answer", "amberbox doctor FOLDER")
+
+    def fileno(self) -> int:
+        """Return the file descriptor to wait for."""
+        return self._socket.fileno()
+
+    def send(self, message: ToGate) -> None:
+        """Send a message."""
         try:
             self._socket.sendall(packed(message))
-            end_s = time.monotonic() + _SEND_S
-            while time.monotonic() < end_s:
-                data = self._socket.recv(_READ)
-                if not data:
-                    break
-                for encoded in self._buffer.feed(data):
-                    found = _FROM_GATE.decode(encoded)
-                    if isinstance(found, SiteState):
-                        return found
+        except OSError as error:
+            raise AmberboxError(f"the command process does not answer: {error}") from error
+
+    def received(self, wait_s: float) -> list[FromGate]:
+        """Return what has come, after waiting for it at most so long."""
+        try:
+            if not wait_readable([self._socket], wait_s):
+                return []
+            data = self._socket.recv(_READ)
+            if not data:
+                raise AmberboxError("the command process has ended", "amberbox doctor FOLDER")
+            return [_FROM_GATE.decode(encoded) for encoded in self._buffer.feed(data)]
         except (OSError, ValueError, msgspec.MsgspecError) as error:
             raise AmberboxError(f"the command process does not answer: {error}") from error
-        raise AmberboxError("the command process does not answer", "amberbox doctor FOLDER")
 
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+
+
+class SiteOrder:
+    """An action that the command process carries out for somebody at the robot.
+
+    Call ``renew`` at least once a second, and ``wait`` until it returns the outcome. Raises
+    AmberboxError where no command process answers, or it ends.
+    """
+
+    def __init__(
+        self, store: Path, action: str, parameters: str, *, who: str = "", confirmed: bool = False,
+        report: Callable[[str], None] = lambda text: None,
+    ) -> None:  # fmt: skip
+        self._connection, self._who, self._report = SiteConnection(store), who, report
+        self.id = new_command_id()
+        self._connection.send(SiteOrders(self.id, action, parameters, who, confirmed))
+
+    def filenos(self) -> Sequence[int]:
+        """Return the file descriptors to wait for."""
+        return (self._connection.fileno(),)
+
+    def renew(self) -> None:
+        """State that it is still wanted."""
+        self._connection.send(SiteRenews(self.id))
+
+    def abort(self, reason: str) -> None:
+        """Have it stopped; its outcome comes all the same."""
+        self._connection.send(SiteAborts(self.id, f"{self._who}: {reason}"))
+
+    def wait(self, seconds: float) -> OrderOutcome | None:
+        """Wait until there is something new, or so long; return the outcome, if any."""
+        for found in self._connection.received(seconds):
+            if isinstance(found, OrderReport) and found.id == self.id:
+                self._report(found.text)
+            elif isinstance(found, OrderOutcome) and found.id == self.id:
+                return found
+        return None
+
+    def close(self) -> None:
+        """Close the connection; what still runs for it is stopped."""
+        self._connection.close()
 
 
 class SocketPort:
@@ -317,12 +447,12 @@ class SocketPort:
         self._server_id: str | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
-        self._reports: asyncio.Queue[GateReport] = asyncio.Queue()
+        self._reports: asyncio.Queue[GateReport] = asyncio.Queue(_MOST_REPORTS)
         self._revoked: dict[str, None] = {}
 
     def begin(self, server_id: str) -> None:
         """Begin a connection to a server."""
-        self._server_id, self._reports = server_id, asyncio.Queue()
+        self._server_id, self._reports = server_id, asyncio.Queue(_MOST_REPORTS)
         if self._task is None:
             self._task = asyncio.get_running_loop().create_task(self._serve())
         self._send(LinkBegins(server_id))
@@ -357,6 +487,10 @@ class SocketPort:
         """Pass an abort on."""
         self._send(frame)
 
+    def confirm(self, frame: ConfirmFrame) -> None:
+        """Pass a code on."""
+        self._send(frame)
+
     def _send(self, message: ToGate) -> None:
         if self._writer is not None and not self._writer.is_closing():
             if self._writer.transport.get_write_buffer_size() > _MOST_BYTES:
@@ -374,7 +508,7 @@ class SocketPort:
                 if self._server_id is not None:
                     self._send(LinkBegins(self._server_id))
                 await self._read(reader)
-            except (OSError, ValueError, msgspec.MsgspecError):
+            except (OSError, ValueError, msgspec.MsgspecError, asyncio.QueueFull):
                 pass
             finally:
                 if self._writer is not None:
@@ -388,7 +522,8 @@ class SocketPort:
             for encoded in buffer.feed(data):
                 message = _FROM_GATE.decode(encoded)
                 if isinstance(message, Challenge):
-                    self._reports.put_nowait(MintedChallenge(message.challenge, message.lease))
+                    minted = MintedChallenge(*msgspec.structs.astuple(message))
+                    self._reports.put_nowait(minted)
                 elif isinstance(message, Announcement):
                     self._reports.put_nowait(ActionAnnouncement(message.actions))
                 elif isinstance(message, Answers):

@@ -34,7 +34,16 @@ from amberbox.core.redaction import (
     sounds_secret,
 )
 from amberbox.core.yaml_nodes import Node, parse_yaml
-from amberbox.link.folders import FILES, UNPACKED_BYTES, address, pack, travels
+from amberbox.link.folders import (
+    FILES,
+    PICTURE_BYTES,
+    PICTURES_BYTES,
+    UNPACKED_BYTES,
+    address,
+    is_picture,
+    pack,
+    travels,
+)
 from amberbox.link.join_line import LOOKS_LIKE_ONE
 from amberbox.link.uploader import CopyError, UploadTransport
 
@@ -225,8 +234,8 @@ def _is_yaml(name: str) -> bool:
 _FILE_BYTES = 4 << 20  # larger files are not sent: declarations are written by people
 
 
-def packed_folder(folder: RobotFolder) -> bytes:
-    """Return the packed folder with secrets masked.
+def packed_folder(folder: RobotFolder, *, pictures: bool = False) -> bytes:
+    """Return the packed folder with secrets masked, and with as many ``pictures`` as are taken.
 
     Raises AmberboxError when it no longer matches its hash, or is too large.
     """
@@ -239,12 +248,37 @@ def packed_folder(folder: RobotFolder) -> bytes:
     read = {name: files[name].read_bytes() for name in chosen[:FILES]}
     if sum(map(len, read.values())) > UNPACKED_BYTES:
         raise AmberboxError(f"the folder has more than {UNPACKED_BYTES} bytes", "move data out")
-    return pack(masked(read, _own_keys(folder)))
+    drawn = _pictures(files, FILES - len(read)) if pictures else {}
+    read |= {name: data for name, data in drawn.items() if _is_svg(name)}
+    sent = masked(read, _own_keys(folder))
+    sent |= {name: data for name, data in drawn.items() if not _is_svg(name)}
+    return pack(sent, pictures=pictures)
 
 
-def send_folder(folder: RobotFolder, send: UploadTransport) -> None:
-    """Send a folder; raises CopyError to retry later, AmberboxError when it cannot be sent."""
-    packed = packed_folder(folder)
+def _is_svg(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() == ".svg"
+
+
+def _pictures(files: Mapping[str, Path], count: int) -> dict[str, bytes]:
+    """Return the pictures of experiments, in order of their names, as many as a server takes."""
+    found: dict[str, bytes] = {}
+    size = 0
+    for name in sorted(files):
+        if not is_picture(name) or files[name].is_symlink() or len(found) == count:
+            continue
+        more = files[name].stat().st_size
+        if more <= PICTURE_BYTES and size + more <= PICTURES_BYTES:
+            found[name] = files[name].read_bytes()
+            size += more
+    return found
+
+
+def send_folder(folder: RobotFolder, send: UploadTransport, *, pictures: bool = False) -> None:
+    """Send a folder, with ``pictures`` to servers that take them.
+
+    Raises CopyError to retry later, AmberboxError when it cannot be sent.
+    """
+    packed = packed_folder(folder, pictures=pictures)
     headers = {"Content-Type": "application/octet-stream"}
     reply = send("PUT", address(folder.config_hash), headers, packed)
     if not 200 <= reply.status < 300:

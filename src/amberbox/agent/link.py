@@ -20,15 +20,16 @@ from amberbox.agent.command_socket import SocketPort
 from amberbox.agent.doctor.processes import LINK_STATE_FILE
 from amberbox.agent.folder_upload import send_folder
 from amberbox.blackbox.robot_folder.folder import RobotFolder
+from amberbox.blackbox.store.live_condition import LiveCondition
 from amberbox.blackbox.store.store import Store
 from amberbox.core.errors import AmberboxError
 from amberbox.core.systemd import Notifier
+from amberbox.link import limits
 from amberbox.link.client import LinkClient, ServerRequestHandlers
 from amberbox.link.connection import link_options, tls_context
 from amberbox.link.frames import FetchFrame
 from amberbox.link.policy import (
     CopySituation,
-    DockWatcher,
     Network,
     allowed_traffic,
     current_network,
@@ -121,9 +122,9 @@ class LinkProcess:
         self._network = _Networks(network)
         self.options = link_options(folder)
         self._link_events = LinkEvents(store)
-        self._dock = DockWatcher(store.path, self.options.docked)
+        self._dock = LiveCondition(store.path, self.options.docked)
         asked = ServerRequestHandlers(self._fetch, self._want_folder)
-        port = SocketPort(store.path) if folder.robot.commands else None
+        port = SocketPort(store.path)
         self.client = LinkClient(
             store, self.options, asked=asked, port=port, network=self._network,
             monitoring=read_heartbeat,
@@ -136,7 +137,7 @@ class LinkProcess:
         self._holdings = HoldingsCheck(copier, self._contact)
         self._requests = FetchRequests(
             store, self.client.answers.append, self.client.clock.wall_ns, copier.is_settled,
-            self._holdings.may_lack,
+            self._holdings.may_lack, lambda: self.client.left_out,
         )  # fmt: skip
         self.loop = CopyLoop(
             copier, self._requests, self._send_folder, self._may_copy, self._holdings
@@ -215,14 +216,17 @@ class LinkProcess:
         )
 
     def _situation(self) -> CopySituation:
-        return CopySituation(self._dock.docked, self._network(), self._requests.journals)
+        return CopySituation(
+            self._dock.value, self._network(), self._requests.journals, self.client.left_out
+        )
 
     def _send_folder(self) -> None:
         if not self._wanted.is_set():
             return
         self._wanted.clear()
         try:
-            send_folder(self._folder, self._sending)
+            pictures = limits.PICTURES in self.client.server_can
+            send_folder(self._folder, self._sending, pictures=pictures)
         except AmberboxError as error:  # retrying would fail as well
             self._link_events.emit("folder_not_sent", error.what)
         except Exception:

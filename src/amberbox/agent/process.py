@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +18,12 @@ from typing import Protocol
 from amberbox.blackbox.robot_folder.folder import ROBOT_FILE
 from amberbox.blackbox.robot_folder.robot_yaml import KEY_FILE
 from amberbox.blackbox.store.store import Store, is_locked
-from amberbox.core.yaml_nodes import load_yaml
+from amberbox.core.child_process import ChildOutput, read_all
+from amberbox.core.files import wait_readable
+from amberbox.core.yaml_nodes import Node, load_yaml
 from amberbox.monitoring.component_files import FOLDER as COMPONENTS
 
-RECORD, WATCH, LINK, ACT = "record", "watch", "link", "act"
+RECORD, WATCH, LINK, ACT, MIRROR, DETECT = "record", "watch", "link", "act", "mirror", "detect"
 REFUSED = 2  # exit status of a process that refuses its configuration
 
 
@@ -51,7 +52,7 @@ class ChildProcess:
 def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[ChildProcess]:
     """Return the child processes of a robot folder, the recorder first.
 
-    The link ends last, so that it sends what the others have written.
+    The link and the mirror end last, so that they send what the others have written.
     """
     recorder = ChildProcess(
         RECORD, amberbox_command(RECORD, "--quiet", str(folder)), stage=1, end_s=9.0,
@@ -72,7 +73,14 @@ def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Chi
     actor = ChildProcess(
         ACT, amberbox_command(ACT, *words, str(folder)), end_s=12.0, watchdog_s=20.0, follows=RECORD
     )
-    return [recorder, watcher, linker, actor]
+    mirror = ChildProcess(
+        MIRROR, amberbox_command(MIRROR, *words, str(folder)), stage=2, end_s=10.0, nice=5,
+        follows=RECORD,
+    )  # fmt: skip
+    detector = ChildProcess(
+        DETECT, amberbox_command(DETECT, *words, str(folder)), end_s=4.0, nice=10, follows=RECORD
+    )
+    return [recorder, watcher, linker, actor, mirror, detector]
 
 
 def amberbox_command(*arguments: str) -> list[str]:
@@ -86,99 +94,47 @@ def is_wanted(child: ChildProcess, folder: Path) -> bool:
         return has_server(folder)
     if child.name == ACT:
         return takes_commands(folder)
+    if child.name == MIRROR:
+        return has_mirror(folder)
+    if child.name == DETECT:
+        return has_detection(folder)
     return child.name != WATCH or has_components(folder)
 
 
 def has_server(folder: Path) -> bool:
     """Return whether a robot folder names a server and has its key."""
-    root = load_yaml(folder / ROBOT_FILE, []) if (folder / ROBOT_FILE).exists() else None
-    server = (root.mapping or {}).get("server") if root is not None else None
+    server = _robot_keys(folder).get("server")
     keys = (server.mapping or {}) if server is not None else {}
     return bool(keys) and ((folder / KEY_FILE).exists() or "token" in keys)
 
 
-def takes_commands(folder: Path) -> bool:
-    """Return whether a robot folder names a server, and a trust file for its commands."""
+def has_mirror(folder: Path) -> bool:
+    """Return whether a robot folder names a database that items are copied to."""
+    database = _robot_keys(folder).get("mongodb")
+    return database is not None and bool(database.mapping)
+
+
+def has_detection(folder: Path) -> bool:
+    """Return whether a robot folder names a model of detectors."""
+    detection = _robot_keys(folder).get("detection")
+    return detection is not None and bool(detection.mapping)
+
+
+def _robot_keys(folder: Path) -> Mapping[str, Node]:
     root = load_yaml(folder / ROBOT_FILE, []) if (folder / ROBOT_FILE).exists() else None
-    return has_server(folder) and "commands" in ((root.mapping if root else None) or {})
+    return (root.mapping if root else None) or {}
+
+
+def takes_commands(folder: Path) -> bool:
+    """Return whether somebody may command the robot: a server, people at it, or its own rules."""
+    given = _robot_keys(folder)
+    return has_server(folder) or "commands" in given or "recovery" in given
 
 
 def has_components(folder: Path) -> bool:
     """Return whether a robot folder has component files."""
     place = folder / COMPONENTS
     return any(place.rglob("*.yaml")) or any(place.rglob("*.yml"))
-
-
-BURST = 100
-PER_S = 5.0
-_LINE = 2000
-_READ = 1 << 16
-
-
-def print_line(text: str) -> None:
-    """Print a line to stderr; a closed stderr is ignored."""
-    with suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
-
-
-@dataclass
-class ChildOutput:
-    """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; further lines
-    are counted.
-    """
-
-    name: str
-    emit: Callable[[str], None] = print_line
-    error: str = ""
-    """The last line that begins with ``error:``: why it has ended, most likely."""
-    _rest: bytes = b""
-    _room: float = BURST
-    _at_s: float = 0.0
-    _left_out: int = 0
-
-    def feed(self, data: bytes, now_s: float) -> None:
-        """Add output of the child; it may end within a line."""
-        *lines, rest = (self._rest + data).split(b"\n")
-        self._rest = rest[:_LINE]
-        self._fill(now_s)
-        for line in lines:
-            self._print(line[:_LINE].decode(errors="replace").rstrip())
-
-    def end(self, now_s: float) -> None:
-        """Print the unfinished last line."""
-        if self._rest:
-            self.feed(b"\n", now_s)
-        self._fill(now_s)
-
-    def _fill(self, now_s: float) -> None:
-        self._room = min(BURST, self._room + (now_s - self._at_s) * PER_S)
-        self._at_s = now_s
-        if self._left_out and self._room >= 1:
-            count, self._left_out = self._left_out, 0
-            self._room -= 1
-            self.emit(f"{self.name}: ({count} more line{'s' * (count > 1)}, left out)")
-
-    def _print(self, line: str) -> None:
-        if line.startswith("error: "):
-            self.error = line.removeprefix("error: ")
-        if not line:
-            return
-        if self._room < 1:
-            self._left_out += 1
-            return
-        self._room -= 1
-        self.emit(f"{self.name}: {line}")
-
-
-def read_all(fd: int) -> bytes:
-    """Return what can be read without blocking; empty at the end."""
-    found = b""
-    with suppress(BlockingIOError):
-        while block := os.read(fd, _READ):
-            found += block
-            if len(found) >= 1 << 20:  # endless output: the rest is read next time
-                break
-    return found
 
 
 _CREDENTIALS = struct.Struct("3i")
@@ -331,7 +287,9 @@ def command_of(child: ChildProcess) -> list[str]:
 
 
 # the lock that each child holds; its file contains the process id
-WRITER_OF = {WATCH: "watch", RECORD: "main", LINK: "link", ACT: "act"}
+WRITER_OF = {
+    WATCH: "watch", RECORD: "main", LINK: "link", ACT: "act", MIRROR: "mirror", DETECT: "detect",
+}  # fmt: skip
 _END_S = 10.0
 
 
@@ -366,8 +324,8 @@ def _end(pid: int, within_s: float) -> None:
             if within_s:
                 signal.pidfd_send_signal(watched, signal.SIGTERM)
                 signal.pidfd_send_signal(watched, signal.SIGCONT)
-            if not select.select([watched], [], [], within_s)[0]:
+            if not wait_readable([watched], within_s):
                 signal.pidfd_send_signal(watched, signal.SIGKILL)
-                select.select([watched], [], [], _END_S)
+                wait_readable([watched], _END_S)
         finally:
             os.close(watched)

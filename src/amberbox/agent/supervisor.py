@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import select
 import signal
 import threading
 import time
@@ -28,23 +27,24 @@ from amberbox.agent.folder_changes import (
 )
 from amberbox.agent.process import (
     ACT,
+    DETECT,
     LINK,
+    MIRROR,
     RECORD,
     REFUSED,
     WATCH,
     WRITER_OF,
-    ChildOutput,
     ChildProcess,
     Launch,
     Process,
     RealProcess,
     end_orphan,
     is_wanted,
-    print_line,
 )
 from amberbox.blackbox.store import store
 from amberbox.blackbox.store.store import EVENT_REQUEST, Store, WriterLock
-from amberbox.core.files import replace_file
+from amberbox.core.child_process import ChildOutput, print_line
+from amberbox.core.files import replace_file, wait_readable
 from amberbox.core.pacing import Backoff
 from amberbox.core.systemd import ALL_INPUTS_ENDED, Notifier
 
@@ -372,7 +372,7 @@ class ProcessSupervisor:
             for lifecycle in self.lifecycles
             if lifecycle.process is not None
         ]
-        select.select([fd for fds in busy for fd in fds], [], [], _TICK_S)
+        wait_readable([fd for fds in busy for fd in fds], _TICK_S)
 
     # -- starting
 
@@ -445,7 +445,7 @@ class ProcessSupervisor:
             text += "; the recorder goes on as it began, until a reload or a restart"
         self._log.log_event("configuration_changed", text)
         self._wanted = self._wanted_children()
-        for name in (WATCH, LINK, ACT):
+        for name in (WATCH, LINK, ACT, MIRROR, DETECT):
             self._restart(name, now_s)
 
     def _restart(self, name: str, now_s: float) -> None:

@@ -17,6 +17,7 @@ UNITS = Path("/etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")
 _TEMPORARY = ("/tmp", "/var/tmp")  # private to a service with PrivateTmp
 _WATCHDOG_S = 10
+_CAPTURING = ("ethercat",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,8 @@ class Service:
     ring: Path | None = None
     verb: str = "record"
     """What runs: the recorder alone, or ``run`` that supervises it and what monitors."""
+    captures: bool = False
+    """Whether a source receives all frames of a network interface."""
 
     @property
     def unit(self) -> str:
@@ -54,7 +57,8 @@ def service_of(folder: RobotFolder, name: str, user: str, verb: str = "record") 
     options = folder.robot.store
     ring = (path / options.ring_path).resolve() if options.ring_path else None
     about = name, user, folder.robot.id, path, store, options.write_s
-    return Service(*about, ring=ring, verb=verb)
+    captures = any(block.plugin in _CAPTURING for block in folder.blocks)
+    return Service(*about, ring=ring, verb=verb, captures=captures)
 
 
 def unit_text(service: Service) -> str:
@@ -97,6 +101,7 @@ def _service(service: Service) -> Sequence[str]:
         "IOSchedulingClass=best-effort",
         "IOSchedulingPriority=1",
         "NoNewPrivileges=yes",
+        *(("AmbientCapabilities=CAP_NET_RAW",) if service.captures else ()),
         *_protection(service),
     )
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from amberbox.blackbox.signing.keys import public_key
 from amberbox.blackbox.signing.signatures import HEADS
-from amberbox.blackbox.store.store import Store
+from amberbox.blackbox.store.store import FOLDERS, Store
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import replace_file
@@ -45,6 +45,7 @@ from amberbox.link.frames import (
     BeatFrame,
     Bye,
     CommandsFrame,
+    ConfirmFrame,
     DurableFrame,
     FetchFrame,
     FrameError,
@@ -68,7 +69,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.policy import AllowedTraffic, Network, allowed_traffic, current_network
 from amberbox.link.record_reader import LinkEvents, LiveValues, RawRowTail, ReachReader
-from amberbox.link.robot_end import OutOfStepError, RobotEnd
+from amberbox.link.robot_end import Lane, OutOfStepError, RobotEnd
 
 # A wall clock that moved more than this against the time since boot was set
 STEP_NS = 50_000_000
@@ -174,13 +175,13 @@ class LinkSession:
         self._line = line
         self._server_id = welcome.server_id
         self._reach_reader = reach_reader
-        self._reaches = dict(reaches)
         self._end = RobotEnd()
         ends = {w: reaches[w].end if w in reaches else START for w in limits.WRITERS}
         self._end.welcome(welcome, ends, capabilities)
+        self._reaches = self._taken(reaches)
         self._fresh: dict[str, RawRowTail] = {}
         self._old: dict[str, RawRowTail] = {}
-        for writer in limits.WRITERS:
+        for writer in self._end.writers:
             start, join = self._end.starts(writer)
             self._fresh[writer] = RawRowTail(client.store, writer, join)
             if start < join:
@@ -191,6 +192,17 @@ class LinkSession:
         self._bare_at = -1
         self._ending = False
         self._heads = b""
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """Folders of journals that the server does not know."""
+        unknown = {w for w in limits.WRITERS if w not in self._end.writers}
+        if limits.DETECT_JOURNALS not in self._client.server_can:
+            unknown.add("detect")
+        return frozenset(FOLDERS[writer] for writer in unknown)
+
+    def _taken(self, reaches: Mapping[str, WriterReach]) -> dict[str, WriterReach]:
+        return {writer: reaches[writer] for writer in self._end.writers if writer in reaches}
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve the connection; raises LinkDownError when it breaks."""
@@ -218,7 +230,7 @@ class LinkSession:
     async def _last(self, tasks: list[asyncio.Task[None]]) -> None:
         """Send the last rows, wait for their acknowledgement for a while, and send Bye."""
         self._ending = True
-        self._reaches = await asyncio.to_thread(self._reach_reader.state)
+        self._reaches = self._taken(await asyncio.to_thread(self._reach_reader.state))
         self._offered.set()
         await self._send(DurableFrame(self._end.epoch, self._reaches))
         until = asyncio.get_running_loop().time() + _LAST_S
@@ -278,6 +290,8 @@ class LinkSession:
             port.lease(frame)
         elif isinstance(frame, AbortFrame):
             port.abort(frame)
+        elif isinstance(frame, ConfirmFrame):
+            port.confirm(frame)
 
     async def _send_reports(self) -> None:
         while True:
@@ -288,7 +302,7 @@ class LinkSession:
         """Read new rows first, then old ones, as far as the lanes have room."""
         while True:
             moved = False
-            for writer in [w for w in limits.WRITERS if w in self._reaches]:
+            for writer in list(self._reaches):
                 moved |= await self._read_fresh(writer)
                 moved |= await self._read_old(writer)
             if moved:
@@ -297,7 +311,10 @@ class LinkSession:
 
     async def _read_fresh(self, writer: str) -> bool:
         tail, end = self._fresh[writer], self._end
-        room = _WAITING - max(end.waiting("urgent"), end.waiting("status"))
+        # reports of an action that wait for a slow line do not keep alarms from being read
+        is_later = writer in limits.LATER_WRITERS
+        lanes: tuple[Lane, ...] = ("command",) if is_later else ("urgent", "status")
+        room = _WAITING - max(map(end.waiting, lanes))
         before = tail.place
         if room <= 0:
             return False
@@ -353,7 +370,7 @@ class LinkSession:
                 self._offered.set()
             if self._client.current_key() != self._client.announced_key:
                 raise LinkDownError("the store signs with a key that the server does not know yet")
-            reaches = await asyncio.to_thread(self._reach_reader.state)
+            reaches = self._taken(await asyncio.to_thread(self._reach_reader.state))
             if self._is_due(reaches):
                 await self._send(DurableFrame(self._end.epoch, reaches))
                 self._reaches = reaches
@@ -508,6 +525,10 @@ class LinkClient:
         self.live = LiveValues(store)
         self.answers: deque[FetchAnswer] = deque()
         """Answers to fetch requests; they wait for a connection."""
+        self.left_out = frozenset(FOLDERS[writer] for writer in (*limits.LATER_WRITERS, "detect"))
+        """Folders of journals that the server does not know, as far as it has said yet."""
+        self.server_can: frozenset[str] = frozenset()
+        """What the server says that it can."""
         self.announced_key = ""
         """The public key that was sent to the server, which verifies journals with it."""
         self._dial = dialer
@@ -546,6 +567,7 @@ class LinkClient:
         line = await self._dial(self.options, context)
         try:
             session = await self._greet(line)
+            self.left_out = session.left_out
             self._backoff.succeeded()
             self._link_events.clear("link_refused")
             self.progress.connected, self.progress.trouble = True, ""
@@ -564,12 +586,15 @@ class LinkClient:
         reaches = await asyncio.to_thread(self._reaches.state)
         self.announced_key = self.current_key()
         capabilities = list(self.port.capabilities)
+        first = {w: reach for w, reach in reaches.items() if w in limits.FIRST_WRITERS}
+        more = {w: reach for w, reach in reaches.items() if w not in first}
         hello = Hello(
-            self.options.robot, self.store.id, self.clock.boot_id(), reaches,
+            self.options.robot, self.store.id, self.clock.boot_id(), first,
             self.options.config_hash, self.clock.wall_ns(), self.clock.boot_ns(), __version__,
-            public_key=self.announced_key, capabilities=capabilities,
+            public_key=self.announced_key, capabilities=capabilities, more=more,
         )  # fmt: skip
         answer = await greet(line, hello)
+        self.server_can = frozenset(answer.capabilities)
         if answer.wants_folder:
             self.asked.folder(self.options.config_hash)
         self.watch_variables(answer.watch)

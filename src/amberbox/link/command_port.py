@@ -8,15 +8,18 @@ from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 from amberbox.core.command import CommandAnswer, LeaseState
-from amberbox.link.frames import AbortFrame, LeaseFrame
+from amberbox.link.frames import AbortFrame, ConfirmFrame, LeaseFrame
 
 
 @dataclass(frozen=True, slots=True)
 class MintedChallenge:
-    """Random bytes that the gate has minted, and who holds the robot now."""
+    """Random bytes that the gate has minted, who holds the robot now, and which motion waits."""
 
     challenge: bytes
     lease: LeaseState
+    waiting: str = ""
+    by_code: bool = False
+    tries: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +78,9 @@ class CommandPort(Protocol):
     def abort(self, frame: AbortFrame) -> None:
         """Stop what a run or a command does, safely."""
 
+    def confirm(self, frame: ConfirmFrame) -> None:
+        """Confirm the motion that waits, if the code is right."""
+
 
 class NoCommands:
     """The port of a robot without a gate: it says no capability, so that nothing comes."""
@@ -105,4 +111,7 @@ class NoCommands:
         """Do nothing."""
 
     def abort(self, frame: AbortFrame) -> None:
+        """Do nothing."""
+
+    def confirm(self, frame: ConfirmFrame) -> None:
         """Do nothing."""

@@ -1,5 +1,6 @@
 """Robot folders packed for the server: declarations only, never executable files.
 
+Pictures of experiments, ``experiments/NAME.png``, go along to servers that say that they take them.
 A packed folder is msgpack of contents by name, compressed with zstd. Both ends apply the same
 limits.
 """
@@ -18,8 +19,15 @@ from amberbox.link.limits import PATH
 
 # Suffixes of the files that are sent
 SUFFIXES = frozenset({".yaml", ".yml", ".pl", ".bpmn", ".md", ".txt", ".csv", ".xml"})
+# Pictures, directly in this folder; PICTURE_BYTES of one, PICTURES_BYTES of all
+PICTURES = "experiments"
+PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".svg"})
+PICTURE_BYTES = 5_000_000
+PICTURES_BYTES = 16 << 20
 PACKED_BYTES = 8 << 20
 UNPACKED_BYTES = 32 << 20
+# What a server takes at most, with pictures
+TAKEN_BYTES = PACKED_BYTES + PICTURES_BYTES
 FILES = 2000
 _NAME_LENGTH = 512
 _PART_BYTES = 255
@@ -45,21 +53,33 @@ def address(config_hash: str) -> str:
 
 
 def travels(name: str) -> bool:
-    """Return whether a file is sent to the server, by its name relative to the folder."""
+    """Return whether a file is sent to every server, by its name relative to the folder."""
     path = PurePosixPath(name)
     return path.suffix.lower() in SUFFIXES and not _complaint(name)
 
 
-def pack(files: Mapping[str, bytes]) -> bytes:
-    """Pack the files of a folder that may be sent; leave out the others.
+def is_picture(name: str) -> bool:
+    """Return whether a file is a picture of an experiment, by its name relative to the folder."""
+    path = PurePosixPath(name)
+    is_one = path.suffix.lower() in PICTURE_SUFFIXES and str(path.parent) == PICTURES
+    return is_one and not _complaint(name)
 
-    Raises FolderError beyond the limits.
+
+def pack(files: Mapping[str, bytes], *, pictures: bool = False) -> bytes:
+    """Pack the files of a folder that may be sent, with ``pictures`` those, too.
+
+    Others are left out. Raises FolderError beyond the limits.
     """
-    chosen = {name: files[name] for name in sorted(files) if travels(name)}
+    chosen = {
+        name: files[name]
+        for name in sorted(files)
+        if travels(name) or (pictures and is_picture(name))
+    }
     _check(chosen)
     packed = zstandard.ZstdCompressor(level=_LEVEL).compress(msgspec.msgpack.encode(chosen))
-    if len(packed) > PACKED_BYTES:
-        raise FolderError(f"the folder has {len(packed)} bytes, packed: {PACKED_BYTES} are taken")
+    most = TAKEN_BYTES if pictures else PACKED_BYTES
+    if len(packed) > most:
+        raise FolderError(f"the folder has {len(packed)} bytes, packed: {most} are taken")
     return packed
 
 
@@ -82,10 +102,11 @@ def unpack(data: bytes) -> dict[str, bytes]:
 
 def _decompressed(data: bytes) -> bytes:
     """Decompress data that states its size, if that is within the limit."""
-    if len(data) > PACKED_BYTES:
-        raise FolderError(f"a packed folder has at most {PACKED_BYTES} bytes")
-    if not 0 <= zstandard.frame_content_size(data) <= UNPACKED_BYTES + (1 << 20):
-        raise FolderError(f"a folder has at most {UNPACKED_BYTES} bytes, and says how many")
+    if len(data) > TAKEN_BYTES:
+        raise FolderError(f"a packed folder has at most {TAKEN_BYTES} bytes")
+    most = UNPACKED_BYTES + PICTURES_BYTES
+    if not 0 <= zstandard.frame_content_size(data) <= most + (1 << 20):
+        raise FolderError(f"a folder has at most {most} bytes, and says how many")
     opener = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
     return opener.decompress(data, allow_extra_data=False)
 
@@ -93,9 +114,14 @@ def _decompressed(data: bytes) -> bytes:
 def _check(files: Mapping[str, bytes]) -> None:
     if len(files) > FILES:
         raise FolderError(f"the folder has {len(files)} files: {FILES} are taken")
-    total = sum(map(len, files.values()))
+    drawn = {name: len(data) for name, data in files.items() if is_picture(name)}
+    total = sum(len(data) for name, data in files.items() if name not in drawn)
     if total > UNPACKED_BYTES:
         raise FolderError(f"the files have {total} bytes: {UNPACKED_BYTES} are taken")
+    if sum(drawn.values()) > PICTURES_BYTES or any(size > PICTURE_BYTES for size in drawn.values()):
+        raise FolderError(
+            f"pictures have {PICTURE_BYTES} bytes at most, all of them {PICTURES_BYTES}"
+        )
     for name in _in_the_way(files):
         raise FolderError(f"{name!r} is a file, and a folder of others")
 
@@ -117,9 +143,9 @@ def _complaint(name: str) -> str:
 
 
 def _no_declaration(name: str) -> str:
-    if PurePosixPath(name).suffix.lower() in SUFFIXES:
+    if PurePosixPath(name).suffix.lower() in SUFFIXES or is_picture(name):
         return ""
-    return f"only {', '.join(sorted(SUFFIXES))} travel"
+    return f"only {', '.join(sorted(SUFFIXES))} travel, and pictures of {PICTURES}/"
 
 
 def _in_the_way(names: Collection[str]) -> Iterator[str]:

@@ -17,6 +17,7 @@ from amberbox.core.command import (
     CHALLENGE_BYTES,
     COMMAND_BYTES,
     CommandAnswer,
+    CommandId,
     KeyId,
     LeaseState,
 )
@@ -116,7 +117,10 @@ class LinkRow(Struct, frozen=True, array_like=True):
 
 
 class Hello(Struct, frozen=True, tag="hello"):
-    """The robot's first frame: its id and store, how far its journals reach, what it can do."""
+    """The robot's first frame: its id and store, how far its journals reach, what it can do.
+
+    ``more`` are the journals of ``limits.LATER_WRITERS``, which servers before them overlook.
+    """
 
     robot: Name
     store_id: Name
@@ -129,6 +133,7 @@ class Hello(Struct, frozen=True, tag="hello"):
     protocol: int = limits.PROTOCOL
     public_key: Name = ""
     capabilities: Capabilities = []
+    more: Writers = {}
 
 
 class RowsFrame(Struct, frozen=True, tag="rows"):
@@ -197,12 +202,17 @@ class HasFrame(Struct, frozen=True, tag="has"):
 class ChallengeFrame(Struct, frozen=True, tag="challenge"):
     """Random bytes that the robot has minted, for signatures of the next minute; its lease.
 
-    It is sent at the beginning, every 10 s, and whenever the lease changes.
+    It is sent at the beginning, every 10 s, and whenever the lease or the motion changes that waits
+    for its confirmation: ``waiting`` is the command's id, ``by_code`` whether a code is shown at
+    the robot for it, ``tries`` how many wrong codes were entered.
     """
 
     epoch: Count
     challenge: Annotated[bytes, Meta(min_length=CHALLENGE_BYTES, max_length=CHALLENGE_BYTES)]
     lease: LeaseState = LeaseState()
+    waiting: Annotated[str, Meta(pattern=r"\A([0-9a-f]{32})?\Z")] = ""
+    by_code: bool = False
+    tries: Count = 0
 
 
 class ActionsFrame(Struct, frozen=True, tag="actions"):
@@ -292,10 +302,21 @@ class LeaseFrame(Struct, frozen=True, tag="lease"):
 
 
 class AbortFrame(Struct, frozen=True, tag="abort"):
-    """Stop what a run or one command does, safely; without either all that the robot does."""
+    """Stop what a run or one command does, safely; without either all that the robot does.
+
+    ``who`` is the person, as the server says.
+    """
 
     run: Name = ""
     command: Name = ""
+    who: Name = ""
+
+
+class ConfirmFrame(Struct, frozen=True, tag="code"):
+    """The code that somebody has read at the robot, to confirm this motion and no other."""
+
+    command: CommandId
+    code: Annotated[str, Meta(max_length=16)]
 
 
 class Bye(Struct, frozen=True, tag="bye"):
@@ -308,7 +329,7 @@ class Bye(Struct, frozen=True, tag="bye"):
 # Frames that need the capability limits.COMMANDS, said by both ends
 RobotCommandFrame: TypeAlias = ChallengeFrame | ActionsFrame | AnswersFrame
 ServerCommandFrame: TypeAlias = (
-    CommandsFrame | AnsweredFrame | RevokedFrame | LeaseFrame | AbortFrame
+    CommandsFrame | AnsweredFrame | RevokedFrame | LeaseFrame | AbortFrame | ConfirmFrame
 )
 RobotFrame: TypeAlias = (
     Hello

@@ -29,6 +29,12 @@ TEXT_BYTES = 4096
 
 # The capability to carry commands: neither end sends a frame of commands unless both have said it
 COMMANDS = "commands1"
+# The capability of a server to take rows and journals of LATER_WRITERS
+ACT_ROWS = "act1"
+# The capability of a server to take journals of the detectors
+DETECT_JOURNALS = "detect1"
+# The capability of a server to take pictures of experiments in robots' folders
+PICTURES = "pictures1"
 # What an end may say that it can, and the longest name of a capability or of a frame
 CAPABILITIES = 64
 CAPABILITY_LENGTH = 64
@@ -48,12 +54,16 @@ SILENT_S = 5.0
 # Journals are uploaded in pieces of this size
 PIECE_BYTES = 4 << 20
 
-# Writers whose conclusions go over the link
-WRITERS = ("main", "keep", "watch")
+# Writers whose conclusions go over the link; servers before ACT_ROWS end it over the later ones
+FIRST_WRITERS = ("main", "keep", "watch")
+LATER_WRITERS = ("act", "experiment")
+WRITERS = FIRST_WRITERS + LATER_WRITERS
 URGENT = frozenset({channels.ALARM, channels.DIAGNOSIS, channels.EVENT, channels.SYMPTOM,
                     channels.INCIDENT, channels.MISSION, channels.GAP})  # fmt: skip
-# Channels whose rows go over the link; of these all but statuses go first
-CHANNELS = URGENT | {channels.STATUS}
+# Rows of commands and of experiments: after the urgent ones, before statuses
+COMMAND_CHANNELS = frozenset({channels.COMMAND, channels.EXPERIMENT})
+# Channels whose rows go over the link
+CHANNELS = URGENT | COMMAND_CHANNELS | {channels.STATUS}
 
 
 # The server has no admin yet; retrying helps only once one exists

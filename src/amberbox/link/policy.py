@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import threading
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -13,11 +12,6 @@ from typing import Protocol
 
 from amberbox.blackbox.robot_folder.robot_yaml import NETWORK
 from amberbox.blackbox.store.manifest_entries import SealedJournal
-from amberbox.blackbox.store.tail import follow
-from amberbox.core.conditions import ConditionWatcher, WatchedCondition
-from amberbox.core.errors import AmberboxError
-from amberbox.core.expression import parse
-from amberbox.core.types import Batch
 from amberbox.link.robot_end import LANES, Lane
 
 _ROUTES = Path("/proc/net/route")
@@ -50,12 +44,12 @@ def allowed_traffic(
 ) -> AllowedTraffic:
     """Return what may be sent over a network; over a metered one only what cannot wait.
 
-    That is alarms, diagnoses and events, and, if ``statuses``, new statuses. The backlog, live
-    values and journals wait for another network.
+    That is alarms, diagnoses, events and commands, and, if ``statuses``, new statuses. The backlog,
+    live values and journals wait for another network.
     """
     if not any(network.is_called(pattern) for pattern in metered):
         return AllowedTraffic()
-    lanes: frozenset[Lane] = frozenset({"urgent", "status"} if statuses else {"urgent"})
+    lanes = frozenset(LANES) - ({"backlog"} if statuses else {"backlog", "status"})
     return AllowedTraffic(lanes, live=False, copies=False)
 
 
@@ -99,52 +93,6 @@ def _read(path: Path) -> str:
         return ""
 
 
-_NAME = "docked"
-_LOOKBACK_S = 600.0
-_POLL_S = 0.5
-_AGAIN_S = 30.0
-
-
-class DockWatcher:
-    """Evaluates the docking expression in a thread; ``docked`` is None while it is unknown."""
-
-    def __init__(self, store: Path, expression: str) -> None:
-        self._store, self._text = store, expression
-        self._stop = threading.Event()
-        self.docked: bool | None = None
-        self.problem = ""
-        """Why the expression cannot be evaluated."""
-
-    def start(self) -> None:
-        """Start the thread, if there is an expression."""
-        if self._text:
-            threading.Thread(target=self._run, name="link dock", daemon=True).start()
-
-    def close(self) -> None:
-        """Stop the thread."""
-        self._stop.set()
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            try:
-                self._follow()
-            except (AmberboxError, OSError) as error:  # the store may appear later, or again
-                self.docked, self.problem = None, str(error)
-            self._stop.wait(_AGAIN_S)
-
-    def _follow(self) -> None:
-        conditions = ConditionWatcher({_NAME: WatchedCondition(parse(self._text))})
-        batches = follow(
-            self._store, conditions.items, None, _LOOKBACK_S, stop=self._stop, poll_s=_POLL_S
-        )
-        for found in batches:
-            if isinstance(found, Batch) and len(found.received_ns):
-                conditions.add(found)
-                conditions.edges(int(found.received_ns[-1]))
-                self.docked = _NAME in conditions.true
-                self.problem = "; ".join(conditions.problems.values())
-
-
 class PinnedWindow(Protocol):
     """A window of the record that an incident keeps."""
 
@@ -160,11 +108,13 @@ class CopySituation:
     """Inputs of the copy rule; ``docked`` is None where it is unknown.
 
     ``requested`` are journals of fetch requests, which are copied whenever copying is allowed.
+    ``left_out`` are folders of journals that the server does not know.
     """
 
     docked: bool | None = None
     network: Network = _NOWHERE
     requested: frozenset[str] = frozenset()
+    left_out: frozenset[str] = frozenset()
 
 
 def may_copy(when: str, situation: CopySituation) -> bool:

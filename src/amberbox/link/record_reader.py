@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.blackbox.columns.arrays import element
 from amberbox.blackbox.journal.chunk import Chunk
 from amberbox.blackbox.journal.scan import start_record
 from amberbox.blackbox.journal.tail import JournalHead, read_head
@@ -25,7 +26,7 @@ from amberbox.blackbox.store.store import Store, is_locked, request_event, run_a
 from amberbox.blackbox.store.tail import Delivery, WriterTail, follow
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import sync_file
-from amberbox.core.types import Batch, IntArray, WriterCursor
+from amberbox.core.types import Batch, IntArray, Ragged, WriterCursor
 from amberbox.link import limits
 from amberbox.link.frames import START, JournalPosition, LinkRow, RunEnd, WriterReach
 
@@ -232,10 +233,15 @@ def by_item(variables: Sequence[str]) -> dict[str, list[str]]:
 
 
 def latest_values(batch: Batch, variables: Sequence[str]) -> Iterator[tuple[str, Value]]:
-    """Yield the last value of each variable of a batch, with its receive time."""
+    """Yield the last value of each variable of a batch, or element of a list (``ranges[90]``), with
+    its receive time.
+    """
     at_ns = int(batch.received_ns[-1])
     for variable in variables:
-        column = batch.columns.get(variable)
+        name, _, index = variable.removesuffix("]").partition("[")
+        column = batch.columns.get(name)
+        if isinstance(column, Ragged) and index.isdecimal():
+            column = element(column, int(index))
         if isinstance(column, np.ndarray) and column.ndim == 1 and len(column):
             yield f"{batch.item}.{variable}", (at_ns, _plain(column[-1]))
 

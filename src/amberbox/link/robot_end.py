@@ -1,7 +1,8 @@
 """The robot's end of the link: what to send next, and how answers are processed.
 
-No input or output, no clock. Rows wait in three lanes: urgent (alarms, diagnoses, events),
-statuses, and the backlog written while there was no link.
+No input or output, no clock. Rows wait in lanes: urgent (alarms, diagnoses, events), commands,
+statuses, and the backlog written while there was no link. Commands have a lane of their own, so
+that alarms never wait behind the reports of an action.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from amberbox.link.frames import (
     WriterReach,
 )
 
-Lane = Literal["urgent", "status", "backlog"]
-LANES: tuple[Lane, ...] = ("urgent", "status", "backlog")
+Lane = Literal["urgent", "command", "status", "backlog"]
+LANES: tuple[Lane, ...] = ("urgent", "command", "status", "backlog")
 # Approximate overhead of a row in a frame, besides its data and channel
 _OVERHEAD = 48
 
@@ -65,6 +66,8 @@ class RobotEnd:
     """The number of the next frame of answers to commands."""
     carries_commands: bool = False
     """Whether both ends have said that they carry commands."""
+    writers: tuple[str, ...] = limits.FIRST_WRITERS
+    """The writers whose rows and journals the server takes."""
     sent_upto: dict[str, JournalPosition] = field(default_factory=dict)
     _lanes: dict[Lane, deque[LinkRow]] = field(default_factory=lambda: {n: deque() for n in LANES})
     _reading: dict[str, _Reading] = field(default_factory=dict)
@@ -86,10 +89,12 @@ class RobotEnd:
         self.sent_upto = dict(self.cursor)
         for lane in self._lanes.values():
             lane.clear()
+        is_later = limits.ACT_ROWS in frame.capabilities
+        self.writers = limits.WRITERS if is_later else limits.FIRST_WRITERS
         self._reading = {}
-        for writer, end in ends.items():
+        for writer in ends.keys() & set(self.writers):
             at = self.cursor.get(writer, START)
-            join = max(end, at)
+            join = max(ends[writer], at)
             self._reading[writer] = _Reading(at, join, join)
 
     def starts(self, writer: str) -> tuple[JournalPosition, JournalPosition]:
@@ -100,7 +105,7 @@ class RobotEnd:
     def offer_fresh(self, writer: str, rows: Sequence[LinkRow], read_to: JournalPosition) -> None:
         """Add new rows of a writer, which was read up to ``read_to``."""
         for row in rows:
-            self._lanes["urgent" if row.channel in limits.URGENT else "status"].append(row)
+            self._lanes[_lane_of(row.channel)].append(row)
         reading = self._reading[writer]
         reading.fresh_at = max(reading.fresh_at, read_to)
 
@@ -190,7 +195,10 @@ class RobotEnd:
     def command_frames(self, report: GateReport) -> Iterator[RobotCommandFrame]:
         """Yield the frames that carry what the gate reports."""
         if isinstance(report, MintedChallenge):
-            yield ChallengeFrame(self.epoch, report.challenge, report.lease)
+            yield ChallengeFrame(
+                self.epoch, report.challenge, report.lease, report.waiting, report.by_code,
+                report.tries,
+            )  # fmt: skip
         elif isinstance(report, ActionAnnouncement):
             yield ActionsFrame(self.epoch, report.actions)
         else:
@@ -201,6 +209,13 @@ class RobotEnd:
     def backlog(self, reaches: Mapping[str, WriterReach]) -> int:
         """Return the approximate number of positions between the acknowledged ones and the end."""
         return sum(_between(self.cursor.get(w, START), reach) for w, reach in reaches.items())
+
+
+def _lane_of(channel: str) -> Lane:
+    """Return the lane of new rows of a channel."""
+    if channel in limits.URGENT:
+        return "urgent"
+    return "command" if channel in limits.COMMAND_CHANNELS else "status"
 
 
 def _fitting(answers: Sequence[CommandAnswer]) -> Iterator[list[CommandAnswer]]:

@@ -136,7 +136,7 @@ class ServerEnd:
         self.reaches = dict(self.hello.writers)
         return Welcome(
             admission.epoch, admission.cursor, wall_ns, wants_folder, list(watch),
-            [limits.COMMANDS], server_id,
+            [limits.COMMANDS, limits.ACT_ROWS, limits.PICTURES, limits.DETECT_JOURNALS], server_id,
         )  # fmt: skip
 
     def stored(self, number: int, stored: StoredRows) -> Ack:
@@ -160,6 +160,8 @@ class ServerEnd:
             return self._end(text, for_good=True)
         if hello.robot != self.robot:
             return self._end(f"the key is not that of {hello.robot}", for_good=True)
+        more = {w: reach for w, reach in hello.more.items() if w in limits.LATER_WRITERS}
+        hello = msgspec.structs.replace(hello, writers={**hello.writers, **more}, more={})
         wrong = _wrong(hello.writers)
         if wrong:
             return self._end(wrong)

@@ -28,7 +28,15 @@ from amberbox.blackbox.store import manifest
 from amberbox.blackbox.store.incident import StoredIncident, load_all
 from amberbox.blackbox.store.journal_reader import extent, journal_file
 from amberbox.blackbox.store.manifest import Manifest, confirm, unconfirm
-from amberbox.blackbox.store.store import FOLDERS, INCIDENTS, Store, is_locked, run_and_number
+from amberbox.blackbox.store.store import (
+    FOLDERS,
+    INCIDENTS,
+    Store,
+    finish,
+    is_locked,
+    pending,
+    run_and_number,
+)
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import replace_file
@@ -51,7 +59,9 @@ from amberbox.link.uploads import (
 )
 
 REQUESTS_FILE = "link-requests.json"
-_WRITERS = ("main", "bulk", "ring", "watch", "keep")
+# Kind of the store's requests to send a journal again
+COPY_KIND = "copy"
+_WRITERS = ("main", "bulk", "ring", "watch", "keep", "act", "experiment", "detect")
 # Corrected times may differ from those in a journal by smaller steps of the wall clock
 _MARGIN_NS = 2 * NS
 # Largest number of stored requests; the oldest are dropped, as the server repeats requests
@@ -77,9 +87,11 @@ class FetchRequests:
         wall_ns: Callable[[], int],
         is_settled: Callable[[str], bool] = lambda name: False,
         lacks: Callable[[str], bool] = lambda name: False,
+        left_out: Callable[[], Collection[str]] = frozenset,
     ) -> None:
         self._store, self._answer = store, answer
         self._wall_ns, self._is_settled, self._lacks = wall_ns, is_settled, lacks
+        self._left_out = left_out
         self._lock = threading.Lock()
         self._open: dict[str, FetchRequest] = {
             r.id: r for r in _read_requests(store.path / REQUESTS_FILE)
@@ -119,7 +131,11 @@ class FetchRequests:
     def _find(
         self, request: FetchRequest, known: Manifest, *, is_news: bool
     ) -> tuple[tuple[str, int], ...]:
-        files = tuple(journals_of(self._store, request, known))
+        left_out = self._left_out()
+        files = tuple(
+            file for file in journals_of(self._store, request, known)
+            if _folder(file[0]) not in left_out
+        )  # fmt: skip
         answered = {name for name, _ in self._answered.get(request.id, ())}
         if is_news or {name for name, _ in files} != answered:
             self._answered[request.id] = files
@@ -160,6 +176,10 @@ def journals_of(store: Store, request: FetchRequest, known: Manifest) -> Iterato
             meets = span is not None and span[0] <= request.to_ns and span[1] >= request.from_ns
             if meets and (not item or item in _items(path, name)):
                 yield name, size_of(path)
+
+
+def _folder(journal: str) -> str:
+    return journal.partition("/")[0]
 
 
 def _span(path: Path, name: str, known: Manifest) -> tuple[int, int] | None:
@@ -237,6 +257,8 @@ class HttpTransport:
 
     options: LinkOptions
     context: Callable[[], ssl.SSLContext | None]
+    most_bytes: int = _ANSWER_BYTES
+    """How much of an answer is read."""
     _connection: http.client.HTTPConnection | None = None
 
     def __call__(
@@ -252,7 +274,7 @@ class HttpTransport:
             everything = authorization(self.options) | headers | length
             connection.request(method, base + path, body or None, everything)
             answer = connection.getresponse()
-            content = answer.read(_ANSWER_BYTES)
+            content = answer.read(self.most_bytes)
             offset = int(answer.headers.get(uploads.OFFSET) or 0)
         except (OSError, http.client.HTTPException, ValueError) as error:
             self.close()
@@ -313,6 +335,7 @@ class JournalCopier:
         names = [*(name for name in held if name not in known), *names]
         asked = _of_ring(self.store, now.requested - known)
         names = [*asked, *(name for name in names if name not in asked)]
+        names = [name for name in names if _folder(name) not in now.left_out]
         awaited = self._awaited(found.unsigned)
         return [name for name in names if name not in self._refused and name not in awaited]
 
@@ -329,9 +352,10 @@ class JournalCopier:
         """Return whether this copier will do nothing more about a journal."""
         return name in self._refused
 
-    def copy_again(self, journals: Collection[str]) -> None:
-        """Mark journals for another copy that the server lacks although it confirmed or refused
-        them.
+    def copy_again(self, journals: Collection[str], *, is_lost: bool = True) -> None:
+        """Mark journals for another copy that the server confirmed or refused.
+
+        ``is_lost``: it lacks them now, which is an event; else somebody wants a better copy.
         """
         again = frozenset(journals)
         self._refused -= again
@@ -341,10 +365,18 @@ class JournalCopier:
             return
         self.lacking |= lost
         host = urlsplit(self.options.url).netloc
-        if self.link_events is not None:
+        if self.link_events is not None and is_lost:
             self.link_events.clear("server_lacks")  # the same journals may be lost twice
             self.link_events.emit("server_lacks", _lost_text(host, sorted(lost)))
         unconfirm(self.store, sorted(lost), host)
+
+    def take_requests(self) -> None:
+        """Mark the journals that another process asks to send again."""
+        asked = [one for one in pending(self.store) if one.kind == COPY_KIND]
+        if asked:
+            self.copy_again({str(one.values.get("journal")) for one in asked}, is_lost=False)
+        for request in asked:
+            finish(request)
 
     def step(self) -> bool:
         """Copy the next journal; return whether there was one. Raises CopyError to retry later."""
@@ -546,6 +578,8 @@ class HoldingsCheck:
 
 
 POLL_S = 2.0
+# Interval of looks whether something was sealed
+_LOOK_S = 0.2
 
 
 @dataclass(slots=True)
@@ -569,6 +603,7 @@ class CopyLoop:
         """Work until the copier's ``stop`` is set."""
         stop = self.copier.stop
         while not stop.is_set():
+            known = self._manifest_bytes()
             try:
                 worked = self.step()
             except (CopyError, AmberboxError, OSError) as error:
@@ -578,12 +613,23 @@ class CopyLoop:
                 self.backoff.succeeded()
                 self.trouble = ""
                 if not worked:
-                    self.wake.wait(POLL_S)
-                    self.wake.clear()
+                    self._wait(known)
+
+    def _wait(self, known_bytes: int) -> None:
+        """Wait for the next poll, or until something has been sealed since, or is asked for."""
+        end_s = time.monotonic() + POLL_S
+        while time.monotonic() < end_s and self._manifest_bytes() == known_bytes:
+            if self.wake.wait(_LOOK_S):
+                break
+        self.wake.clear()
+
+    def _manifest_bytes(self) -> int:
+        return size_of(self.copier.store.path / manifest.NAME)
 
     def step(self) -> bool:
         """Do the next job; return whether there was one. Raises errors that may be temporary."""
         self.requests.step()
+        self.copier.take_requests()
         trouble: CopyError | None = None
         try:
             if self.holdings is not None:

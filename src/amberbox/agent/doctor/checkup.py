@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from amberbox.agent.doctor.disk import file_system, latency, root, space, wear
-from amberbox.agent.doctor.processes import link, recorder, service, supervisor
+from amberbox.agent.doctor.processes import link, mirror, recorder, service, supervisor
 from amberbox.agent.doctor.subject import (
     DoctorFinding,
     ExaminedRobot,
@@ -25,7 +25,7 @@ from amberbox.blackbox.robot_folder.black_box_yaml import SourceBlock
 from amberbox.blackbox.robot_folder.folder import SOURCES
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import open_to_all
-from amberbox.core.plugins import get, install_hint, missing_packages
+from amberbox.core.plugins import Plugin, get, install_hint, missing_packages
 from amberbox.core.version import __version__
 
 # programs that set the clock, by process name
@@ -190,11 +190,16 @@ def passivity(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFindin
     """Check of each source that it is passive and that its library is installed."""
     for block in subject.folder.blocks if subject.folder else ():
         yield _passive(block)
-        plugin = get(SOURCES, block.plugin)
-        missing = missing_packages(plugin)
-        if missing:
-            hint = install_hint(plugin.name) or f"pip install {' '.join(missing)}"
-            yield error(f"source {block.name}", f"lacks {', '.join(missing)}", hint)
+        lacking = missing_library(get(SOURCES, block.plugin))
+        if lacking is not None:
+            yield error(f"source {block.name}", *lacking)
+
+
+def missing_library(plugin: Plugin) -> tuple[str, str] | None:
+    """Return which packages a plugin lacks, and how to install them; None if it has all."""
+    missing = missing_packages(plugin)
+    hint = install_hint(plugin.name) or f"pip install {' '.join(missing)}"
+    return (f"lacks {', '.join(missing)}", hint) if missing else None
 
 
 def _passive(block: SourceBlock) -> DoctorFinding:
@@ -210,7 +215,7 @@ Check: TypeAlias = Callable[[ExaminedRobot, HostSystem], Iterable[DoctorFinding]
 
 # in the order of the report
 CHECKS: Sequence[Check] = (
-    *(configuration, passivity, recorder, supervisor, link, service, power),
+    *(configuration, passivity, recorder, supervisor, link, mirror, service, power),
     *(clock, rtc, space, file_system, root, wear, latency),
     *(keys, versions),
 )

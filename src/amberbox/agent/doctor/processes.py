@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from amberbox.agent.doctor.subject import (
     warn,
 )
 from amberbox.agent.systemd_unit import UNITS, argument
+from amberbox.blackbox.journal.scan import late_ns_of, start_record
 from amberbox.blackbox.journal.tail import JournalHead, read_head
 from amberbox.blackbox.retention.usage import FULL, RESERVE
 from amberbox.blackbox.robot_folder.robot_yaml import read_key
@@ -38,13 +40,22 @@ def recorder(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding
         yield warn("recorder", "nothing has been recorded yet", f"amberbox record {subject.path}")
         return
     head = _newest_head(store)
-    late_s = max(_PATIENCE_S, 20 * subject.options.write_s)
+    late_s = max(_PATIENCE_S, 20 * subject.options.write_s) + _held_back_s(store, head)
     found = judged_recorder(writer_pid(store), head, host.clock.wall_ns(), late_s, subject.path)
     why = why_only_events(store, subject.options.reserve)
     if why and found.level == "ok":
         hint = "amberbox events tells since when; make room, raise store.quota or lower keep_min"
         found = error("recorder", f"{found.found}, but only events are recorded: {why}", hint)
     yield found
+
+
+def _held_back_s(store: Store, head: JournalHead | None) -> float:
+    """Return how long messages that come late may hold the watermark back, in seconds."""
+    if head is None or not head.file:
+        return 0.0
+    with suppress(OSError):
+        return late_ns_of(start_record(store.folder("main") / head.file)) / NS
+    return 0.0
 
 
 def _newest_head(store: Store) -> JournalHead | None:
@@ -223,3 +234,48 @@ def link_in_words(state: Mapping[str, Any], now_ns: int) -> str:
     unknown = int(state.get("unknown_frames", 0))
     ignored = f", {unknown} frames of its newer version were ignored" if unknown else ""
     return f"linked to {server}{waits}{ignored}"
+
+
+MIRROR_STATE_FILE = "mirror-state.json"  # file in the store with the state of ``amberbox mirror``
+MIRROR_LOCK = "mirror"  # its lock
+
+
+def mirror(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
+    """Check the copying to a database, if the folder names one."""
+    options = subject.folder.robot.mongodb if subject.folder is not None else None
+    if options is None:
+        return
+    if find_spec("pymongo") is None:
+        yield error("mirror", "lacks pymongo", "pip install 'amberbox[formats]'")
+    elif subject.store is None or not is_locked(subject.store, MIRROR_LOCK):
+        what = f"nothing copies to {options.host}/{options.database} now"
+        yield warn("mirror", what, f"amberbox run {subject.path} keeps it going")
+    else:
+        state = read_state(subject.store, MIRROR_STATE_FILE)
+        yield judged_mirror(state, time.time_ns(), f"amberbox events {subject.path}")
+
+
+def judged_mirror(state: Mapping[str, Any], now_ns: int, hint: str) -> DoctorFinding:
+    """Check the mirror by the state that it wrote."""
+    words = mirror_in_words(state, now_ns)
+    is_old = now_ns - int(state.get("at_ns", 0)) > _OLD_NS
+    is_whole = not (state.get("refused") or state.get("missed"))
+    is_fine = state.get("connected") and not is_old and is_whole
+    return ok("mirror", words) if is_fine else warn("mirror", words, hint)
+
+
+def mirror_in_words(state: Mapping[str, Any], now_ns: int) -> str:
+    """Return a line on the copies in a database."""
+    target = state.get("target", "the database")
+    age_ns = now_ns - int(state.get("at_ns", 0))
+    if age_ns > _OLD_NS:
+        return f"the mirror to {target} has said nothing for {in_time(age_ns / NS)}"
+    if not state.get("connected"):
+        trouble = str(state.get("trouble", ""))
+        return f"no connection to {target}{f': {trouble}' if trouble else ''}"
+    reached_ns = int(state.get("mirrored_ns", 0))
+    until = f", up to {in_time((now_ns - reached_ns) / NS)} ago" if reached_ns else ""
+    refused, missed = int(state.get("refused", 0)), int(state.get("missed", 0))
+    bad = f", {refused} documents were refused" if refused else ""
+    bad += f", {missed} records were gone before they were copied" if missed else ""
+    return f"copies to {target}: {state.get('documents', 0)} documents{until}{bad}"
