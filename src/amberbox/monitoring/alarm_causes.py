@@ -19,7 +19,7 @@ from amberbox.core.types import (
     Status,
 )
 from amberbox.core.units import LIKELY, confidence_word, percent
-from amberbox.monitoring.alarms import FOLLOWS, NEVER_NS, Action, ComponentAlarms
+from amberbox.monitoring.alarms import FOLLOWS, NEVER_NS, ComponentAlarms, PersonAction
 from amberbox.monitoring.component_states import NO_MONITOR, Blocker, OwnState, highest
 from amberbox.monitoring.findings import (
     AlarmChange,
@@ -258,11 +258,9 @@ class DiagnosedAlarms:
         known = [active, self._had, self._due_ns]
         return next((key for some in known for key in keys if key in some), keys[0])
 
-    def command(
-        self, action: Action, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
-    ) -> list[AlarmChange]:
-        """Acknowledge, shelve or unshelve an alarm; raises UsageError if that is not possible."""
-        return [_public(c) for c in self._alarms.command(action, alarm_id, who, at_ns, until_ns)]
+    def command(self, alarm_id: str, done: PersonAction) -> list[AlarmChange]:
+        """Apply a person's action to an alarm; raises UsageError if that is not possible."""
+        return [_public(change) for change in self._alarms.command(alarm_id, done)]
 
     def snapshot(self, now_ns: int) -> dict[str, Any]:
         """Return the state that is needed to continue, as JSON."""
@@ -413,7 +411,10 @@ class AlarmCauses:
         for alarm in active:
             if alarm.id in self._alarms or alarm.id in self._deferred:
                 continue
-            own = replace(alarm, state="open", who="", until_ns=None, live_only=False)
+            own = replace(
+                alarm, state="open", who="", until_ns=None, live_only=False, note="", said_ns=None,
+                command="",
+            )  # fmt: skip
             self.take(own)
             if alarm.live_only:
                 self.take(alarm)
@@ -424,9 +425,7 @@ class AlarmCauses:
         shown = [alarm for alarm in (*active, *self.raised.active()) if alarm.id not in hidden]
         return [self._dated(self._named(alarm)) for alarm in shown]
 
-    def command(
-        self, action: Action, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
-    ) -> list[AlarmChange] | None:
+    def command(self, alarm_id: str, done: PersonAction) -> list[AlarmChange] | None:
         """Apply a person's action to an alarm that a diagnosis raised; None for another alarm.
 
         Raises UsageError if it is not possible, or the alarm is part of another.
@@ -436,7 +435,7 @@ class AlarmCauses:
             raise UsageError(f"the alarm '{alarm_id}' is part of '{root}' now", f"name '{root}'")
         if all(alarm.id != alarm_id for alarm in self.raised.active()):
             return None
-        return self.raised.command(action, alarm_id, who, at_ns, until_ns)
+        return self.raised.command(alarm_id, done)
 
     def _dated(self, alarm: AlarmChange) -> AlarmChange:
         known = self._alarms.get(alarm.id)

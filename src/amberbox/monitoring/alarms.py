@@ -21,7 +21,7 @@ NEVER_NS: Final = 1 << 62
 # start of the reason of an alarm that another component's fault explains
 FOLLOWS: Final = "follows from "
 
-Action: TypeAlias = Literal["acknowledge", "shelve", "unshelve"]
+Action: TypeAlias = Literal["acknowledge", "shelve", "unshelve", "resolve"]
 _RAISING: Final[frozenset[Level]] = frozenset(("warn", "stale", "error"))
 
 
@@ -40,6 +40,21 @@ class _Alarm:
 
 
 @dataclass(frozen=True, slots=True)
+class PersonAction:
+    """What a person does with an alarm at a time (ns); shelving has an end.
+
+    ``command`` is the id of the server's command by which it came, empty for one given here.
+    """
+
+    action: Action
+    who: str
+    at_ns: int
+    until_ns: int | None = None
+    note: str = ""
+    command: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class _UserAction:
     """A person's action: on the alarm of this id, or (shelved) on all until a time."""
 
@@ -48,6 +63,13 @@ class _UserAction:
     who: str
     at_ns: int
     until_ns: int | None = None
+    note: str = ""
+    command: str = ""
+
+
+_STATES: Final[Mapping[Action, AlarmState]] = {
+    "acknowledge": "acknowledged", "shelve": "shelved", "unshelve": "open", "resolve": "resolved",
+}  # fmt: skip
 
 
 class ComponentAlarms:
@@ -79,7 +101,7 @@ class ComponentAlarms:
                 and user_action.until_ns is not None
                 and user_action.until_ns <= now_ns
             ):
-                changes += self._withdraw(component, now_ns)
+                changes += self._withdraw(component, _UserAction("open", "", "", now_ns))
         return again, changes
 
     def update(
@@ -134,7 +156,10 @@ class ComponentAlarms:
     def _worsen(
         self, component: str, alarm: _Alarm, now_ns: int, own: OwnState
     ) -> list[AlarmChange]:
-        """Raise severity or level; an acknowledgement of the lower one no longer counts."""
+        """Raise severity or level; an acknowledgement of the lower one no longer counts.
+
+        Nor is it resolved any more.
+        """
         more_severe = SEVERITIES.index(own.severity) > SEVERITIES.index(alarm.severity)
         higher = RANK[own.level] > RANK[alarm.level]
         if not (more_severe or higher):
@@ -161,12 +186,10 @@ class ComponentAlarms:
 
     def _forget_acknowledgement(self, component: str) -> None:
         user_action = self._user_actions.get(component)
-        if user_action is not None and user_action.state == "acknowledged":
+        if user_action is not None and user_action.state in ("acknowledged", "resolved"):
             del self._user_actions[component]
 
-    def command(
-        self, action: Action, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
-    ) -> list[AlarmChange]:
+    def command(self, alarm_id: str, done: PersonAction) -> list[AlarmChange]:
         """Apply a person's action to an active alarm; shelving needs an end.
 
         Raises UsageError if there is no such alarm, or the action does not apply to it.
@@ -178,30 +201,30 @@ class ComponentAlarms:
                 "amberbox alarm list WHERE shows them",
             )
         component, alarm = lasting[alarm_id]
-        if action not in get_args(Action):
-            raise UsageError(f"'{action}' is nothing that can be done with an alarm")
-        if action == "unshelve":
+        if done.action not in get_args(Action):
+            raise UsageError(f"'{done.action}' is nothing that can be done with an alarm")
+        until_ns = done.until_ns if done.action == "shelve" else None
+        user_action = _UserAction(
+            _STATES[done.action], alarm.id, done.who, done.at_ns, until_ns, done.note, done.command
+        )
+        if done.action == "unshelve":
             if self._state(component) != "shelved":
                 raise UsageError(f"the alarm '{alarm_id}' is not shelved")
-            return self._withdraw(component, at_ns, who)
-        if action == "shelve" and (until_ns is None or until_ns <= at_ns):
+            return self._withdraw(component, user_action)
+        if done.action == "shelve" and (until_ns is None or until_ns <= done.at_ns):
             raise UsageError("an alarm is shelved for some time", "--for 2h")
-        state: AlarmState = "shelved" if action == "shelve" else "acknowledged"
-        user_action = _UserAction(
-            state, alarm.id, who, at_ns, until_ns if state == "shelved" else None
-        )
         self._user_actions[component] = user_action
         if user_action.until_ns is not None:
             heapq.heappush(self._timers, (user_action.until_ns, component))
         return [self._record(component, alarm, user_action)]
 
-    def _withdraw(self, component: str, now_ns: int, who: str = "") -> list[AlarmChange]:
+    def _withdraw(self, component: str, by: _UserAction) -> list[AlarmChange]:
         """Withdraw a person's action; an active alarm is open again."""
         del self._user_actions[component]
         alarm = self._alarms[component]
         if alarm.healed_ns is not None:
             return []
-        return [self._record(component, alarm, _UserAction("open", alarm.id, who, now_ns))]
+        return [self._record(component, alarm, by)]
 
     def _state(self, component: str) -> AlarmState:
         alarm, user_action = self._alarms[component], self._user_actions.get(component)
@@ -223,6 +246,9 @@ class ComponentAlarms:
             alarm.level, alarm.reason, alarm.opened_ns, changed_ns, alarm.count,
             "" if action is None else action.who, None if action is None else action.until_ns,
             config_hash, live_only=action is not None,
+            note="" if action is None else action.note,
+            said_ns=action.at_ns if action is not None and action.who else None,
+            command="" if action is None else action.command,
         )  # fmt: skip
 
     def drop(self, known: Collection[str], now_ns: int) -> list[AlarmChange]:

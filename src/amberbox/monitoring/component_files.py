@@ -271,7 +271,9 @@ class ComponentFileOptions:
     dependency_monitors: DependencyMonitorOptions = option(
         DependencyMonitorOptions(), "which monitor speaks for a dependency"
     )
-    recovery_actions: Sequence[str] = option((), "shown, not carried out")
+    recovery_actions: Sequence[str] = option(
+        (), "what may help: an action with its parameters, or text"
+    )
     part_of: str = option("", "component that it is a part of")
     policy: Policy = option("all", "how many of its modes must be ok: all, any or majority")
 

@@ -27,6 +27,7 @@ from amberbox.blackbox.store.own_records import (
 )
 from amberbox.blackbox.store.store import Store, is_locked
 from amberbox.core.clock import NS, Clock, SystemClock
+from amberbox.core.given_answers import RecordedAnswer, answer_of
 from amberbox.core.robot_status import (
     Monitoring,
     Observed,
@@ -368,6 +369,8 @@ class RecordedFindings:
     symptoms: Sequence[Symptom] = ()
     diagnoses: Sequence[Diagnosis] = ()
     """Revisions by id; the last one is that at the instant."""
+    answers: Sequence[RecordedAnswer] = ()
+    """What people answered to tests."""
 
 
 def record_end_ns(store: Store) -> int | None:
@@ -388,15 +391,21 @@ def was_watched(store: Store, config_hash: str, at_ns: int) -> bool:
 
 
 def findings_until(store: Store, at_ns: int) -> RecordedFindings:
-    """Return the symptoms and diagnoses up to an instant, of all that is kept of the journal."""
+    """Return what is recorded up to an instant, of all that is kept of the journal."""
     symptoms: list[Symptom] = []
     diagnoses: list[Diagnosis] = []
-    for finding in symptoms_and_diagnoses(OwnRecords(store, WRITER, CHANNELS).step()):
+    answers: list[RecordedAnswer] = []
+    for record in OwnRecords(store, WRITER, (*CHANNELS, channels.EVENT)).step():
+        if record.channel == channels.EVENT:
+            given = answer_of(record.values) if record.log_ns <= at_ns else None
+            answers += [] if given is None else [given]
+            continue
+        finding = finding_of(record.channel, record.values)
         if isinstance(finding, Symptom) and (finding.confirmed_ns or 0) <= at_ns:
             symptoms.append(finding)
         elif isinstance(finding, Diagnosis) and finding.at_ns <= at_ns:
             diagnoses.append(finding)
-    return RecordedFindings(symptoms, diagnoses)
+    return RecordedFindings(symptoms, diagnoses, answers)
 
 
 def symptoms_and_diagnoses(records: Iterable[WrittenRecord]) -> Iterable[Symptom | Diagnosis]:

@@ -1,6 +1,6 @@
 """Dependencies between components as files state them: needs, ``part_of``, recovery actions.
 
-``recovery_config.yaml`` of the predecessor is shown with a component and never carried out.
+The restarts of the predecessor's ``recovery_config.yaml`` become recovery actions of components.
 """
 
 from __future__ import annotations
@@ -309,23 +309,28 @@ def with_recovery(
         problems.append(root.problem("file", f"expected components, got {root.kind}"))
         return list(components)
     names = ComponentNames(components)
-    actions: dict[str, str] = {}
+    restarts: dict[str, RecoveryOptions] = {}
     for name, node in root.mapping.items():
         options = build(RecoveryOptions, node, problems, name)
         if options is not None:
             problems.extend(_entry_problems(name, options, node, names))
-            actions[name] = _in_words(options)
-    what = f"{len(root.mapping)} recovery actions are shown, not carried out"
+            restarts[name] = options
+    what = (
+        f"{len(root.mapping)} restarts become recovery actions; nothing carries them out by itself"
+    )
     problems.append(root.problem("file", what, is_error=False))
-    return [_with_action(entry, actions) for entry in components]
+    return [_with_restart(entry, restarts) for entry in components]
 
 
-def _with_action(entry: ComponentEntry, actions: Mapping[str, str]) -> ComponentEntry:
-    action = actions.get(entry.plan.name) or actions.get(entry.plan.id)
-    if action is None:
+def _with_restart(entry: ComponentEntry, restarts: Mapping[str, RecoveryOptions]) -> ComponentEntry:
+    plan = entry.plan
+    options = restarts.get(plan.name) or restarts.get(plan.id)
+    if options is None:
         return entry
-    shown = (*entry.plan.recovery_actions, action)
-    return replace(entry, plan=replace(entry.plan, recovery_actions=shown))
+    text = _in_words(options)
+    units = {**plan.restart_units, text: options.restart}
+    shown = (*plan.recovery_actions, text)
+    return replace(entry, plan=replace(plan, recovery_actions=shown, restart_units=units))
 
 
 def _in_words(options: RecoveryOptions) -> str:

@@ -29,7 +29,7 @@ from amberbox.core.types import (
 
 TICK_NS = NS // 20  # all instants are multiples of this
 OutputCondition: TypeAlias = Literal["ok", "bad", "unknown", "stale"]
-AlarmState: TypeAlias = Literal["open", "acknowledged", "shelved", "healed"]
+AlarmState: TypeAlias = Literal["open", "acknowledged", "shelved", "resolved", "healed"]
 
 
 class OutputChange(NamedTuple):
@@ -97,8 +97,10 @@ class Transition:
 class AlarmChange:
     """An alarm after a change.
 
-    ``count`` is how often it has opened. ``who`` acknowledged or shelved it, ``until_ns`` is the
-    end of shelving. ``cause`` is the leading answer of the ``diagnosis`` (its id) that concerns the
+    ``count`` is how often it has opened. ``who`` acknowledged, shelved or resolved it, or took it
+    from the shelf; ``until_ns`` is the end of shelving, ``note`` what the person wrote, ``said_ns``
+    when they did it, ``command`` the id of the server's command where it was done on the server.
+    ``cause`` is the leading answer of the ``diagnosis`` (its id) that concerns the
     component, both empty while there is none. ``also`` are components whose own alarms are part of
     this one, since they have the same leading cause.
     """
@@ -120,6 +122,9 @@ class AlarmChange:
     cause: str = ""
     diagnosis: str = ""
     also: tuple[str, ...] = ()
+    note: str = ""
+    said_ns: int | None = None
+    command: str = ""
 
 
 # the engine emits all but diagnoses, which are made of them
@@ -243,11 +248,12 @@ _SYMPTOM = RecordCodec(Symptom, {
     "confirmed_ns": TIME_IF_ANY, "strength": NUMBER, "source": SAME,
     "evidence": FieldCodec(_evidence_values, _evidence_of), "blocked_by": TEXTS,
     "reason": FieldCodec(default=""),
+    "size": FieldCodec(read=lambda value: None if value is None else float(value), default=None),
 })  # fmt: skip
 _HYPOTHESIS = RecordCodec(Hypothesis, {
     "id": SAME, "faults": FieldCodec(sorted, frozenset), "probability": NUMBER, "explains": TEXTS,
     "unexplained": TEXTS, "contradicted": TEXTS, "ambiguity": TEXTS, "proof": SAME,
-    "criticality": NUMBER,
+    "criticality": NUMBER, "follows": FieldCodec(sorted, frozenset, default=frozenset()),
 })  # fmt: skip
 _GROUP = RecordCodec(AmbiguityGroup, {
     "members": TEXTS, "probability": NUMBER, "wider": TEXTS, "split_by": SAME,
@@ -255,12 +261,14 @@ _GROUP = RecordCodec(AmbiguityGroup, {
 _TEST = RecordCodec(Test, {
     "id": SAME, "kind": SAME, "text": SAME, "role": SAME, "cost_s": NUMBER, "risk": NUMBER,
     "gain_bits": NUMBER, "outcomes": FieldCodec(_outcomes_values, _outcomes_of),
+    "run": FieldCodec(default=""), "moves": FieldCodec(read=bool, default=False),
 })  # fmt: skip
 _DIAGNOSIS = RecordCodec(Diagnosis, {
     "id": SAME, "revision": WHOLE, "robot": SAME, "at_ns": WHOLE, "state": SAME,
     "symptoms": TEXTS, "hypotheses": _HYPOTHESIS.many, "groups": _GROUP.many,
     "mass_covered": NUMBER, "incomplete": SAME, "findings": TEXTS, "next_tests": _TEST.many,
     "config_hash": SAME, "live_only": FLAG, "make_safe": FieldCodec(read=tuple, default=()),
+    "asked": FieldCodec(read=tuple, default=()),
 })  # fmt: skip
 
 
@@ -385,6 +393,8 @@ _ALARM = RecordCodec(AlarmChange, {
     "reason": SAME, "opened_ns": WHOLE, "changed_ns": WHOLE, "count": WHOLE, "who": SAME,
     "until_ns": TIME_IF_ANY, "cause": FieldCodec(default=""), "diagnosis": FieldCodec(default=""),
     "config_hash": SAME, "live_only": FLAG, "also": FieldCodec(read=tuple, default=()),
+    "note": FieldCodec(default=""), "said_ns": TIME_IF_ANY._replace(default=None),
+    "command": FieldCodec(default=""),
 })  # fmt: skip
 _RECORDS: Final[Mapping[type[Any], tuple[str, RecordCodec[Any]]]] = {
     Status: (channels.STATUS, _STATUS),

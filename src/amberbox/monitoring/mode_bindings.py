@@ -18,6 +18,7 @@ from amberbox.blackbox.columns.variables import (
     names_of,
     tables_of,
 )
+from amberbox.core.detector_items import PREFIX, copied_item
 from amberbox.core.errors import AmberboxError, Problem, did_you_mean
 from amberbox.core.mode import Result
 from amberbox.core.names import has_item_form, item_name
@@ -65,11 +66,17 @@ class InputBinder:
             fitting = [plan for plan in self._short(text) if plan.kind in accepts]
         if not fitting:
             raise InputError(self._nothing(text, found, accepts))
-        unique = {plan.address: plan for plan in fitting}
+        unique = {plan.address: self._copied(plan) for plan in fitting}
         if len(unique) > 1 and "*" not in text:
             shown = " or ".join([*unique][:_SHORT_MOST])
             raise InputError(f"'{text}' is ambiguous: {shown}")
         return list(unique.values())
+
+    def _copied(self, plan: InputPlan) -> InputPlan:
+        """Return the input that stands for an item of the detectors: the watcher's copy of it."""
+        if plan.kind == "probe" or not self.recorded.is_of_detectors(plan.item):
+            return plan
+        return replace(plan, item=copied_item(plan.item))
 
     def _items(self, text: str) -> list[InputPlan]:
         """Find items by their name, or by their topic as configured."""
@@ -107,6 +114,7 @@ class InputBinder:
     def _is_open(self, text: str) -> bool:
         """Return whether a name may be an item that no block names."""
         names = (*(f"{name}_" for name in (*self.recorded.open, SOURCE)), *OWN_ITEMS)
+        names += (PREFIX,) if self.recorded.awaits_detectors else ()
         stored = self.recorded.stored(text.partition(".")[0].partition("/")[0])
         return text.startswith(names) or stored is not None
 
@@ -175,11 +183,11 @@ class InputBinder:
         if found:
             wanted = " or ".join(_WORDS[kind] for kind in accepts)
             return f"'{text}' is {_WORDS[found[0].kind]}, this monitor takes {wanted}"
-        items = [item.name for item in self.recorded.items]
+        items = [*(item.name for item in self.recorded.items), *self.recorded.detectors]
         topics = [item.topic for item in self.recorded.items]
         near = did_you_mean(text, [*items, *topics]) or did_you_mean(_split(text)[0], items)
         if not near and text.startswith("/") and self.recorded.open:
-            near = f"; write {item_name(self.recorded.open[0], text)}, as its block names no topics"
+            near = f"; write {item_name(self.recorded.open[0], text)}: its block does not list it"
         return f"nothing that is recorded is called '{text}'{near}"
 
 

@@ -295,7 +295,8 @@ class MappingRun:
         self._timed = contract.is_timed(mode.config)
         self._is_short = 0 < contract.shortest_window_s(mode.config) < SHORT_S
         # How far back it looks at values; silence and rates take stalls into account themselves.
-        back_s = 0.0 if contract.sees_silence else contract.looks_back_s(mode.config)
+        self._sees_silence = contract.is_called_in_silence(mode.config)
+        back_s = 0.0 if self._sees_silence else contract.looks_back_s(mode.config)
         self.window_ns = round(back_s * NS)
         self._config, self._stale_s = mode.config, mode.stale_s
         results = [*contract.results, *(output.plan.result for output in outputs)]
@@ -355,7 +356,7 @@ class MappingRun:
 
     def _codes(self, block: InstantBlock) -> Any:
         """Return the worst freshness of the inputs; None where all are fresh everywhere."""
-        if self._mode.sees_silence:
+        if self._sees_silence:
             return None
         worst: Any = None
         for entry in self.inputs:

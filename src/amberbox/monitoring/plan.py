@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
+from amberbox.core.detector_items import copied_from
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Result
 from amberbox.core.needs import Needs
@@ -156,6 +157,8 @@ class ComponentPlan:
     part_of: str = ""
     description: str = ""
     recovery_actions: Sequence[str] = ()
+    restart_units: Mapping[str, str] = field(default_factory=dict)
+    """The units of those that stand for a restart, by their text."""
     needs: Needs | None = None
     file: str = ""
 
@@ -181,6 +184,12 @@ class MonitoringPlan:
             for mapping in mode.mappings
             for entry in (*mapping.inputs, *mapping.reads)
         ]
+
+    def own_items(self) -> list[str]:
+        """Return the items that the watcher records itself: of probes, and of detectors' scores."""
+        items = {entry.item for entry in self.inputs()}
+        detected = [item for item in items if copied_from(item)]
+        return sorted({*(order.item for order in self.probes()), *detected})
 
     def probes(self) -> list[ProbeOrder]:
         """Return the probes that have to be run, each once."""
@@ -314,12 +323,6 @@ def needs_text(component: ComponentPlan, joint: str) -> str:
     if component.needs is not None:
         return str(component.needs)
     return joint.join(dict.fromkeys(edge.name for edge in component.dependencies))
-
-
-def list_recovery_actions(plan: MonitoringPlan) -> Iterator[tuple[str, str]]:
-    """Yield each component's recovery actions, which are not carried out."""
-    for component in plan.components:
-        yield from ((component.id, action) for action in component.recovery_actions)
 
 
 def monitor_of(mode: ModePlan) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -16,7 +17,7 @@ from amberbox.blackbox.robot_folder.folder import RobotFolder
 from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
 from amberbox.core.config import build
 from amberbox.core.contracts import ModeContract
-from amberbox.core.errors import AmberboxError, Problem
+from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Result
 from amberbox.core.names import derive_id
@@ -91,7 +92,7 @@ def _complaints(plan: ModePlan, entry: InputPlan, item: RecordedItem) -> Iterato
     if options.keep == _NEVER_KEPT:
         yield f"{item.name} is not recorded (keep: none)", True
         return
-    by_counts = mode.sees_silence or entry.kind == "item"
+    by_counts = mode.is_called_in_silence(plan.config) or entry.kind == "item"
     wanted_hz = wanted_rate_hz(plan.config)
     limit_hz = options.max_frequency
     if limit_hz is not None and wanted_hz is not None and wanted_hz > limit_hz:
@@ -105,12 +106,13 @@ def _complaints(plan: ModePlan, entry: InputPlan, item: RecordedItem) -> Iterato
             f"{1 / limit_hz:g} s (max_frequency)",
             True,
         )
-    if options.change is not None and 0 < window_s < options.change.heartbeat_s:
-        yield (
-            f"looks back over {window_s:g} s, but while nothing changes {item.name} keeps one row "
-            f"in {options.change.heartbeat_s:g} s (change)",
-            True,
-        )
+    for key, thinned in (("change", options.change), ("transforms", options.transforms)):
+        if thinned is not None and 0 < window_s < thinned.heartbeat_s:
+            yield (
+                f"looks back over {window_s:g} s, but while nothing changes {item.name} keeps one "
+                f"row in {thinned.heartbeat_s:g} s ({key})",
+                True,
+            )
 
 
 def _too_short(
@@ -145,7 +147,9 @@ def wanted_rate_hz(config: Any) -> float | None:
         for field in fields(config)
         if field.metadata.get("unit") == "Hz"
     ]
-    return max((float(value) for value in values if value is not None), default=None)
+    each = (value.values() if isinstance(value, Mapping) else [value] for value in values)
+    rates = (float(rate) for several in each for rate in several if rate is not None)
+    return max(rates, default=None)
 
 
 @dataclass(frozen=True)
@@ -156,6 +160,7 @@ class PlanContext:
     inputs: InputBinder
     robot: RobotConfig
     problems: list[Problem]
+    folder: Path = Path()
 
 
 def plan_mode(source: ModeSource, bench: PlanContext) -> ModePlan:
@@ -207,6 +212,8 @@ def _plan(
         return replace(plan, mappings=_outlines(file, node, problems))
     arguments = (node.mapping or {}).get("arguments") or Node(node.file, node.line, None)
     config = build(module.Config, arguments, problems, "arguments")
+    if config is not None:
+        config = _in_folder(module, config, bench.folder, arguments, problems)
     if config is None:
         return replace(plan, module=module, mappings=_outlines(file, node, problems))
     mappings = _Mappings(module, ModeContract.of(module), config, bench.inputs, problems).of(
@@ -214,8 +221,25 @@ def _plan(
     )
     plan = replace(plan, module=module, config=config, mappings=mappings)
     problems.extend(_time_problems(module, config, node))
+    problems.extend(_input_problems(plan, arguments))
     problems.extend(filter_problems(plan, node, bench.inputs.recorded))
     return replace(plan, states=_states(file.states, plan, node, problems))
+
+
+def _in_folder(
+    module: ModuleType, config: Any, folder: Path, arguments: Node, problems: list[Problem]
+) -> Any:
+    """Return the arguments with what files of the folder add; None and problems for mistakes."""
+    seen = ModeContract.of(module).in_folder
+    if seen is None:
+        return config
+    try:
+        return seen(config, folder)
+    except ConfigurationError as error:
+        problems.extend(error.problems)
+    except AmberboxError as error:
+        problems.append(arguments.problem("arguments", error.what, error.hint))
+    return None
 
 
 def _time_problems(module: Any, config: Any, node: Node) -> Iterator[Problem]:
@@ -226,6 +250,14 @@ def _time_problems(module: Any, config: Any, node: Node) -> Iterator[Problem]:
     if not 0 <= seconds < float("inf"):
         what = f"its monitor looks back {seconds:g} s, which cannot be"
         yield _at(node, "monitor").problem("monitor", what)
+
+
+def _input_problems(plan: ModePlan, arguments: Node) -> Iterator[Problem]:
+    """Yield the arguments that do not fit the inputs of a mode."""
+    found = ModeContract.of(plan.module).input_problems
+    texts = [entry.text for mapping in plan.mappings for entry in mapping.inputs]
+    for key, what in () if found is None else found(plan.config, texts):
+        yield _at(arguments, key).problem(f"arguments.{key}", what)
 
 
 def _function(
@@ -407,8 +439,9 @@ def load_plan(folder: RobotFolder, *, own: bool = True) -> tuple[MonitoringPlan,
         return plan, problems
     functions = find_functions(folder.path, own=own)
     bench = PlanContext(
-        functions, InputBinder(RecordedItems(folder), functions), folder.robot, problems
-    )
+        functions, InputBinder(RecordedItems(folder), functions), folder.robot, problems,
+        folder.path,
+    )  # fmt: skip
     found: dict[str, ComponentEntry] = {}
     for source in tree.components:
         entry = _component(source, bench)

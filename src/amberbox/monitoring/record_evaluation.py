@@ -20,6 +20,7 @@ from amberbox.blackbox.store.store import Store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Diagnosis, FaultFacts, Status, Symptom, WriterCursor
 from amberbox.monitoring.alarm_causes import AlarmCauses, DiagnosedAlarms
+from amberbox.monitoring.alarms import PersonAction
 from amberbox.monitoring.engine import Engine
 from amberbox.monitoring.findings import (
     TICK_NS,
@@ -101,13 +102,14 @@ class HangGuard:
 
 
 @contextmanager
-def hang_guard(plan: MonitoringPlan) -> Iterator[None]:
-    """Raise ``HangError`` inside a function of a mode that takes longer than ``LIMIT_S``.
+def hang_guard(plan: MonitoringPlan, others: frozenset[CodeType] = frozenset()) -> Iterator[None]:
+    """Raise ``HangError`` inside a function that takes longer than ``LIMIT_S``.
 
-    The engine treats the interrupted call as a crash of that mode, or does without its explanation.
-    Works in the main thread; in others nothing is guarded.
+    These are those of modes, and ``others``. The engine treats the interrupted call as a crash of
+    that mode, or does without its explanation. Works in the main thread; in others nothing is
+    guarded.
     """
-    codes = frozenset(_codes(plan))
+    codes = frozenset(_codes(plan)) | others
     if threading.current_thread() is not threading.main_thread() or not codes:
         yield
         return
@@ -149,6 +151,14 @@ class Diagnoser(Protocol):
     @property
     def facts(self) -> Mapping[str, FaultFacts]:
         """Return the facts of failure modes, by id; empty if there are none."""
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Return the providers of evidence that it does without, and why."""
+
+    @property
+    def guarded(self) -> frozenset[CodeType]:
+        """Return the code of functions that have to return soon."""
 
     def begin(self, at_ns: int) -> None:
         """Begin an epoch, in which nothing is known yet; an open diagnosis stays open."""
@@ -195,7 +205,10 @@ class DiagnosedEngine:
         self.history_s = engine.history_s
         """How far monitors and conditions look back."""
         facts: Mapping[str, FaultFacts] = {}
+        self.guarded: frozenset[CodeType] = frozenset()
+        """Code of the diagnoser's functions that have to return soon."""
         if diagnoser is not None:
+            self.guarded = diagnoser.guarded
             self.items |= diagnoser.items
             self.history_s = max(self.history_s, diagnoser.history_s)
             facts = diagnoser.facts
@@ -203,6 +216,9 @@ class DiagnosedEngine:
         self._causes = AlarmCauses(facts, DiagnosedAlarms(plan.robot, plan.config_hash))
         self.trouble = ""
         """Why the diagnoser has failed; the reader empties it."""
+        self.left_out: dict[str, str] = {}
+        """Providers of evidence that have failed, and why; the reader empties it."""
+        self._told: dict[str, str] = {}
 
     @property
     def diagnosis(self) -> Diagnosis | None:
@@ -236,6 +252,7 @@ class DiagnosedEngine:
             wanted = [finding for finding in found if isinstance(finding, Status | Symptom)]
             try:
                 diagnosed = self._diagnoser.advance(wanted, until_ns)
+                self._note_left_out(self._diagnoser.left_out)
             except Exception as error:  # as above
                 self._fail(error)
         if self._diagnoser is None and self.diagnosis is not None:
@@ -243,6 +260,11 @@ class DiagnosedEngine:
         return list(
             self._causes.process(_merged(found, diagnosed) if diagnosed else found, until_ns)
         )
+
+    def _note_left_out(self, providers: Mapping[str, str]) -> None:
+        if providers != self._told:
+            self.left_out |= dict(providers.items() - self._told.items())
+            self._told = dict(providers)
 
     def _fail(self, error: Exception) -> None:
         """Leave the diagnoser out and keep the trouble; raise the error if no other can be made."""
@@ -259,13 +281,11 @@ class DiagnosedEngine:
         """Return the active alarms in their present state, with their causes."""
         return self._causes.named(self.states.alarms())
 
-    def command(
-        self, action: Any, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
-    ) -> list[AlarmChange]:
-        """Acknowledge, shelve or unshelve an alarm; raises UsageError if that is not possible."""
-        changes = self._causes.command(action, alarm_id, who, at_ns, until_ns)
+    def command(self, alarm_id: str, done: PersonAction) -> list[AlarmChange]:
+        """Apply a person's action to an alarm; raises UsageError if that is not possible."""
+        changes = self._causes.command(alarm_id, done)
         if changes is None:
-            changes = self.states.command(action, alarm_id, who, at_ns, until_ns)
+            changes = self.states.command(alarm_id, done)
         return [self._causes.take(change) for change in changes]
 
     def snapshot(self) -> dict[str, Any]:
@@ -449,7 +469,7 @@ def replay(
     engine = DiagnosedEngine(Engine(plan), diagnoser and diagnoser())
     evaluation = RecordEvaluation(engine)
     pace = ReplayPace(part.speed, stop or threading.Event())
-    with hang_guard(plan):
+    with hang_guard(plan, engine.guarded):
         for block in blocks(plan, store, engine, part):
             for finding in (one for found in evaluation.take(block) for one in found):
                 at_ns = instant_of(finding)
@@ -465,7 +485,7 @@ def end_of_record(
     """Return the statuses of all modes and components at the end of the record."""
     engine = DiagnosedEngine(Engine(plan), diagnoser and diagnoser())
     evaluation = RecordEvaluation(engine)
-    with hang_guard(plan):
+    with hang_guard(plan, engine.guarded):
         start = before_end(store, WARM_UP_S + engine.history_s)
         for block in _reader(plan, store, engine, start).step():
             for _ in evaluation.take(block):
@@ -488,7 +508,7 @@ def blocks(
 def _reader(
     plan: MonitoringPlan, store: Store, engine: DiagnosedEngine, start: Positions
 ) -> RecordedItemsReader:
-    return RecordedItemsReader(store, engine.items, [order.item for order in plan.probes()], start)
+    return RecordedItemsReader(store, engine.items, plan.own_items(), start)
 
 
 def _is_inside(at_ns: int, part: ReplayOptions) -> bool:

@@ -17,6 +17,7 @@ from amberbox.blackbox.store.journal_reader import JournalFile, newest_first, ru
 from amberbox.blackbox.store.store import Store, is_locked
 from amberbox.blackbox.store.tail import RECORDED, WriterTail, go_back
 from amberbox.core.clock import NS
+from amberbox.core.given_answers import ITEM as ANSWERS
 from amberbox.core.names import identifier
 from amberbox.core.types import Batch, WriterCursor
 from amberbox.monitoring.watcher_journal import Checkpoint, RecordEpoch, epoch_of
@@ -120,8 +121,9 @@ _BACK_NS = 1_000_000_000  # a step back in log time that does not count from boo
 class EpochRows:
     """Rows of one epoch that were written together.
 
-    ``end`` is run and sequence after them. ``last_ns`` is the log time of the last relevant row,
-    ``counted_ns`` of the last counters: later rows are never before it.
+    ``end`` is run and sequence after them. ``last_ns`` is the log time of the last relevant row.
+    ``counted_ns`` is up to when the last counters state that the record is complete,
+    ``complete_ns`` the same by the journal alone: later rows are never before it.
     """
 
     epoch: RecordEpoch
@@ -130,6 +132,7 @@ class EpochRows:
     first_ns: int
     last_ns: int
     counted_ns: int | None
+    complete_ns: int
 
 
 @dataclass(slots=True)
@@ -191,11 +194,12 @@ class WriterStream:
         self.last_ns = max(end_ns for _, end_ns in ends)
         if epoch is None:  # measured by the watcher while it followed no recorder
             return None
-        counted = max((end_ns for item, end_ns in ends if item == COUNTERS), default=None)
+        counted = max((_counted_ns(b) for b in batches if b.item == COUNTERS), default=None)
         rows = [batch for batch in batches if batch.item in self.items]
         first_ns = min(int(batch.log_time_ns[0]) for batch in batches)
         end = batches[0].run, self._tail.seq
-        return EpochRows(epoch, rows, end, first_ns, self.last_ns, counted)
+        complete_ns = self.last_ns - self._tail.late_ns
+        return EpochRows(epoch, rows, end, first_ns, self.last_ns, counted, complete_ns)
 
     def _epoch_of(self, batches: list[Batch]) -> RecordEpoch | None:
         named = {batch.item: batch for batch in batches}
@@ -216,6 +220,16 @@ class WriterStream:
     def _goes_back(self, batches: list[Batch]) -> bool:
         first_ns = min(int(batch.log_time_ns[0]) for batch in batches)
         return self.last_ns is not None and first_ns < self.last_ns - _BACK_NS
+
+
+def _counted_ns(counters: Batch) -> int:
+    """Return the log time (ns) up to which the newest counters state that the record is complete.
+
+    This is their own time unless they state another one, because messages may come late.
+    """
+    column = counters.columns.get("complete_ns")
+    stated = None if column is None or np.ma.is_masked(column[-1]) else column[-1]
+    return int(counters.log_time_ns[-1]) if stated is None else int(stated)
 
 
 def _base_of(clock: Batch) -> int | None:
@@ -262,7 +276,7 @@ class RecordBlock:
 class RecordedItemsReader:
     """Reads items of a store from positions on; ``step`` yields the rows available now.
 
-    ``probes`` are the items that the watcher itself has written.
+    ``probes`` are the items that the watcher itself has written, as it has people's answers.
     """
 
     def __init__(
@@ -273,7 +287,8 @@ class RecordedItemsReader:
         start: Positions | None = None,
     ) -> None:
         self._store = store
-        self._items = {**dict.fromkeys(RECORDED, frozenset(items)), WATCH: frozenset(probes)}
+        own = {*probes, *({ANSWERS} & {*items})}
+        self._items = {**dict.fromkeys(RECORDED, frozenset(items) - {ANSWERS}), WATCH: own}
         self._start = start or {}
         self._given: dict[str, WriterCursor] = {}
         self._streams: dict[str, WriterStream] = {}
@@ -389,7 +404,8 @@ class RecordedItemsReader:
     def _accept(self, writer: str, piece: EpochRows) -> None:
         self._batches += piece.batches
         self._given[writer] = WriterCursor(*piece.end)
-        self._reached[writer] = max(piece.last_ns, self._reached.get(writer, piece.last_ns))
+        reached_ns = piece.last_ns if writer == _MAIN else piece.complete_ns
+        self._reached[writer] = max(reached_ns, self._reached.get(writer, reached_ns))
         if writer == _MAIN and piece.counted_ns is not None:
             self._counted_ns = piece.counted_ns
 

@@ -17,10 +17,12 @@ from amberbox.blackbox.columns.unroll import unroller
 from amberbox.blackbox.columns.variables import is_same_or_below
 from amberbox.blackbox.robot_folder.black_box_yaml import SourceBlock
 from amberbox.blackbox.robot_folder.folder import SOURCES, RobotFolder
+from amberbox.core.detector_items import PREFIX, schemas_of_model
 from amberbox.core.errors import AmberboxError
 from amberbox.core.names import extend_names, item_name, readable_identifier
 from amberbox.core.plugins import get
 from amberbox.core.source import TopicOptions
+from amberbox.core.topic_selection import is_pattern
 from amberbox.core.types import ItemSchema, Schema, Topic
 
 
@@ -49,8 +51,12 @@ class RecordedItems:
         self.items = tuple(
             _named(item for block, topics in known for item in _items(block, topics))
         )
-        self.open = tuple(block.name for block, topics in known if topics is None)
-        """Names of the blocks that record everything they receive."""
+        self.open = tuple(
+            block.name
+            for block, topics in known
+            if topics is None or any(is_pattern(options.name) for options, _ in topics)
+        )
+        """Names of the blocks that record topics which they do not list by name."""
 
     @cached_property
     def by_name(self) -> Mapping[str, RecordedItem]:
@@ -63,7 +69,22 @@ class RecordedItems:
 
     def stored(self, name: str) -> ItemSchema | None:
         """Return the variables of an item that was recorded before."""
-        return self._stored.get(name)
+        return self.detectors.get(name) or self._stored.get(name)
+
+    @cached_property
+    def detectors(self) -> Mapping[str, ItemSchema]:
+        """Return the items of the detectors that the folder names a model of."""
+        options = self._folder.robot.detection
+        return {} if options is None else schemas_of_model(options.file(self._folder.path))
+
+    @property
+    def awaits_detectors(self) -> bool:
+        """Return whether detectors are configured whose model cannot be read here."""
+        return self._folder.robot.detection is not None and not self.detectors
+
+    def is_of_detectors(self, name: str) -> bool:
+        """Return whether detectors write an item: the watcher records a copy of it."""
+        return name.startswith(PREFIX) and name not in self.by_name
 
     def rate_hz(self, name: str) -> float | None:
         """Return the rate of an item, Hz: as recorded before, at most that of its filter."""
@@ -142,6 +163,8 @@ def _items(
     block: SourceBlock, topics: Sequence[tuple[TopicOptions, Topic | None]] | None
 ) -> Iterator[RecordedItem]:
     for options, announced in topics or ():
+        if is_pattern(options.name):
+            continue
         schema = _schema(announced) if announced is not None else schema_of_type(options.type)
         chosen = () if schema is not None else tuple(options.variable_names)
         name = item_name(block.name, options.name)

@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -529,7 +530,8 @@ def single_mode_plan(
     """
     problems: list[Problem] = []
     functions = find_functions(folder)
-    bench = PlanContext(functions, InputBinder(TestItems(file), functions), RobotConfig(), problems)
+    inputs = InputBinder(TestItems(file), functions)
+    bench = PlanContext(functions, inputs, RobotConfig(), problems, folder)
     plan = plan_mode(ModeSource(Path(mode.file), mode), bench)
     component = ComponentPlan(COMPONENT, COMPONENT, (plan,))
     return MonitoringPlan("rule_test", "", (component,)), problems
@@ -550,6 +552,14 @@ class TestItems(RecordedItems):
 
     def rate_hz(self, name: str) -> float | None:
         return None
+
+    @cached_property
+    def detectors(self) -> Mapping[str, ItemSchema]:
+        return {}
+
+    @property
+    def awaits_detectors(self) -> bool:
+        return False
 
 
 def _items(file: RuleTestFile) -> Iterator[RecordedItem]:

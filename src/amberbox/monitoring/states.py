@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Output, Status, Symptom, SymptomState
-from amberbox.monitoring.alarms import NEVER_NS, Action, ComponentAlarms
+from amberbox.monitoring.alarms import NEVER_NS, ComponentAlarms, PersonAction
 from amberbox.monitoring.component_states import (
     ComponentState,
     ModeState,
@@ -475,14 +475,12 @@ class RobotStates:
         """Return the active alarms in their present state."""
         return self._alarms.active()
 
-    def command(
-        self, action: Action, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
-    ) -> list[AlarmChange]:
-        """Apply a person's action to an alarm: ``acknowledge``, ``shelve`` (until), ``unshelve``.
+    def command(self, alarm_id: str, done: PersonAction) -> list[AlarmChange]:
+        """Apply a person's action to an alarm.
 
         The changes returned are ``live_only``. Raises UsageError if there is no such alarm.
         """
-        return self._alarms.command(action, alarm_id, who, at_ns, until_ns)
+        return self._alarms.command(alarm_id, done)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state needed by ``resume``, as JSON, without the plan."""

@@ -11,19 +11,25 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
+
+import msgspec
 
 from amberbox.blackbox.robot_folder.folder import RobotFolder
 from amberbox.blackbox.store.derived_journal import ItemMessage, ReaderProgress
 from amberbox.blackbox.store.store import Store, StoreRequest, WriterLock, finish, pending
 from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.core.errors import UsageError
+from amberbox.core.given_answers import RecordedAnswer
+from amberbox.core.given_findings import KIND as FINDING_KIND
+from amberbox.core.given_findings import RecordedFinding
 from amberbox.core.probe import SOURCE, ProbeOrder
 from amberbox.core.systemd import Notifier
 from amberbox.core.types import Status
 from amberbox.core.version import __version__
-from amberbox.monitoring.alarms import NEVER_NS
+from amberbox.monitoring.alarms import NEVER_NS, PersonAction
 from amberbox.monitoring.current_state import EvaluationLateness, write_watched_files
+from amberbox.monitoring.detector_scores import DetectorScores
 from amberbox.monitoring.engine import Engine
 from amberbox.monitoring.findings import AlarmChange, Finding
 from amberbox.monitoring.plan import MonitoringPlan
@@ -52,6 +58,9 @@ from amberbox.monitoring.watcher_journal import (
 )
 
 KIND = "alarm"
+# Kind of the requests with answers to tests of the open diagnosis
+ANSWER_KIND = "answer"
+Given = TypeVar("Given", RecordedAnswer, RecordedFinding)
 
 
 def apply_alarm_request(
@@ -68,8 +77,10 @@ def apply_alarm_request(
         if type(until_ns) is not int or not 0 <= until_ns < NEVER_NS:
             raise ValueError(f"until_ns: {until_ns!r:.40} is no time")
         until_ns += shift_ns
-    action, alarm_id, who = str(values.get("action")), str(values.get("id")), values.get("who", "")
-    return engine.command(action, alarm_id, str(who), at_ns, until_ns)
+    texts = {name: str(values.get(name, "")) for name in ("who", "note", "command")}
+    action: Any = str(values.get("action"))
+    done = PersonAction(action, at_ns=at_ns, until_ns=until_ns, **texts)
+    return engine.command(str(values.get("id")), done)
 
 
 GONE_S = 2.0  # silence after which a record without recorder counts as ended
@@ -185,8 +196,12 @@ class RecordWatcher:
             else before_checkpoint(watch.store, left)
         )
         self._evaluation = RecordEvaluation(self._engine, memory)
-        probes = [order.item for order in own_probes(watch)]
-        self._reader = RecordedItemsReader(watch.store, self._engine.items, probes, self._start)
+        probes = {order.item for order in watch.plan.probes()}
+        given = probes - {order.item for order in own_probes(watch)}
+        own = [item for item in watch.plan.own_items() if item not in given]
+        self._reader = RecordedItemsReader(watch.store, self._engine.items, own, self._start)
+        self._scores = DetectorScores(watch.store, own)
+        self._scores_read_s = -1e9
         self._silence = SilenceTimer(watch.clock_s)
         self._lateness = EvaluationLateness(watch.store, watch.clock)
         self._is_sound = True
@@ -195,7 +210,9 @@ class RecordWatcher:
         self._noted_s = self._requests_read_s = watch.clock_s()
         self._measured: list[tuple[ProbeOrder, Mapping[str, Any]]] = []
         self._measured_lock = threading.Lock()
-        options = () if watch.folder is None else watch.folder.robot.monitoring.publish
+        folder = watch.folder
+        entries = () if folder is None else folder.robot.monitoring.publish
+        options = [entry.in_folder(folder.path) for entry in entries if folder is not None]
         self._publisher = StatusPublisher(options, watch.plan, watch.clock_s)
         self._notifier = Notifier(monotonic=watch.clock_s)
         self._stop = threading.Event()
@@ -215,7 +232,7 @@ class RecordWatcher:
         try:
             if runner is not None:
                 runner.start()
-            with hang_guard(self._watch.plan):
+            with hang_guard(self._watch.plan, self._engine.guarded):
                 while not stop.is_set():
                     self.step()
                     self._notifier.ready()
@@ -243,6 +260,7 @@ class RecordWatcher:
                 ItemMessage(f"{SOURCE}/{order.topic}", order.item, SOURCE, values)
                 for order, values in taken
             ])  # fmt: skip
+        self._copy_scores()
         for block in self._reader.step():
             self._silence.received()
             self._notifier.alive(self._status_line)
@@ -260,8 +278,11 @@ class RecordWatcher:
             self._silent = list(unknown_statuses(self._engine.statuses(), now_ns, silent_s, reason))
             self._journal.found(self._silent, ())
             self._on_findings(self._silent)
+            self._publisher.changed()
         if self._publisher.is_due():
-            self._publisher.publish(self._known_now())
+            self._publisher.publish(self._known_now(), self._engine.diagnosis)
+        for kind, text in self._publisher.events() if self._journal.is_live else ():
+            self._journal.log_event(kind, text)
         self._is_sound = True
 
     def close(self) -> None:
@@ -280,6 +301,15 @@ class RecordWatcher:
         with self._measured_lock:
             self._measured.append((order, values))
 
+    def _copy_scores(self) -> None:
+        """Write down the new scores of detectors, which modes read with the rows of now."""
+        now_s = self._watch.clock_s()
+        if self._journal.is_live and now_s - self._scores_read_s >= _REQUESTS_S:
+            self._scores_read_s = now_s
+            rows = list(self._scores.take(self._journal.now_ns()))
+            if rows:
+                self._journal.measured(rows)
+
     def _write(self, found: Sequence[Finding]) -> None:
         """Write the findings up to a position, and the position, in one chunk."""
         self._settle(found)
@@ -297,10 +327,16 @@ class RecordWatcher:
             text = f"goes on without diagnosis, which has failed: {self._engine.trouble}"
             self._journal.log_event("diagnosis_failed", text)
             self._engine.trouble = ""
+        for name, why in self._engine.left_out.items():
+            text = f"the diagnosis goes on without its {name}: {why}"
+            self._journal.log_event("evidence_failed", text)
+        self._engine.left_out = {}
         notes = [place.note(self._watch.store.id)]
         if self._watch.clock_s() - self._noted_s >= CHECKPOINT_S:
             notes.append(self._checkpoint(place))
         self._journal.found(found, notes)
+        if self._silent or not all(isinstance(finding, Status) for finding in found):
+            self._publisher.changed()
         self._silent = []
         self._on_findings(found)
 
@@ -363,7 +399,7 @@ class RecordWatcher:
         ).note(self._watch.store.id)  # fmt: skip
 
     def _carry_out_requests(self) -> None:
-        """Carry out requests about alarms, and write a checkpoint at once."""
+        """Carry out requests about alarms, with a checkpoint at once, and write answers down."""
         place, now_s = self._evaluation.place, self._watch.clock_s()
         if (
             place is None
@@ -373,10 +409,13 @@ class RecordWatcher:
             return
         self._requests_read_s = now_s
         for request in pending(self._watch.store):
-            if request.kind != KIND:
-                continue
-            shift_ns = self._journal.now_ns() - self._watch.clock.wall_ns()
-            self._carry_out(request, place, shift_ns)
+            if request.kind == KIND:
+                shift_ns = self._journal.now_ns() - self._watch.clock.wall_ns()
+                self._carry_out(request, place, shift_ns)
+            elif request.kind == ANSWER_KIND:
+                self._take_given(request, RecordedAnswer, self._journal.answered)
+            elif request.kind == FINDING_KIND:
+                self._take_given(request, RecordedFinding, self._journal.detected)
 
     def _carry_out(self, request: StoreRequest, place: EvaluatedPosition, shift_ns: int) -> None:
         """Carry out a request; what cannot be done becomes an event."""
@@ -385,18 +424,32 @@ class RecordWatcher:
         except UsageError as error:  # healed meanwhile, or acknowledged twice
             self._journal.log_event("alarm_refused", f"request refused: {error.what}")
         except ValueError as error:
-            aside = request.path.with_suffix(".refused")  # under a name that is no request
-            with suppress(FileNotFoundError):
-                request.path.rename(aside)
-            self._journal.log_event(
-                "alarm_refused", f"request {aside.name} cannot be read: {error}"
-            )
+            self._set_aside(request, error)
             return
         else:
             if changes:
                 self._journal.found(changes, [self._checkpoint(place)])
                 self._on_findings(changes)
         finish(request)
+
+    def _take_given(
+        self, request: StoreRequest, kind: type[Given], write: Callable[[Given], None]
+    ) -> None:
+        """Write an answer or a finding into the journal, from which the diagnosis reads it."""
+        try:
+            given = msgspec.convert(request.values, kind)
+        except msgspec.ValidationError as error:
+            self._set_aside(request, error)
+            return
+        write(given)
+        finish(request)
+
+    def _set_aside(self, request: StoreRequest, error: Exception) -> None:
+        aside = request.path.with_suffix(".refused")  # under a name that is no request
+        with suppress(FileNotFoundError):
+            request.path.rename(aside)
+        text = f"request {aside.name} cannot be read: {error}"
+        self._journal.log_event(f"{request.kind}_refused", text)
 
 
 def _memory_of(watch: WatcherSetup, history_s: float) -> RecoveredProgress:

@@ -34,6 +34,8 @@ from amberbox.blackbox.store.journal_reader import (
 )
 from amberbox.blackbox.store.store import Store, run_and_number
 from amberbox.core.clock import NS, Clock
+from amberbox.core.given_answers import RecordedAnswer, answer_event
+from amberbox.core.given_findings import RecordedFinding, finding_event
 from amberbox.core.types import Cursor, Diagnosis, Status, WriterCursor
 from amberbox.monitoring.findings import (
     SOURCE,
@@ -310,7 +312,7 @@ def _over(alarm: AlarmChange, at_ns: int) -> AlarmChange:
     changed_ns = max(at_ns, alarm.changed_ns)
     return replace(
         alarm, state="healed", reason=CHANGED, changed_ns=changed_ns, who="", until_ns=None,
-        live_only=True,
+        live_only=True, note="", said_ns=None, command="",
     )  # fmt: skip
 
 
@@ -419,6 +421,17 @@ class WatcherJournal:
         self._own.append(
             [EncodedRecord(*encoded(finding)) for finding in findings], notes, urgent=urgent
         )
+
+    def answered(self, given: RecordedAnswer) -> None:
+        """Write a person's answer to a test: it is read with the rows of its time."""
+        self._write_event(answer_event(given, SOURCE))
+
+    def detected(self, given: RecordedFinding) -> None:
+        """Write a detector's finding: it is read with the rows of its time."""
+        self._write_event(finding_event(given, SOURCE))
+
+    def _write_event(self, values: Mapping[str, Any]) -> None:
+        self._own.append([EncodedRecord(channels.EVENT, msgspec.json.encode(values))], urgent=True)
 
     def log_event(self, kind: str, text: str) -> None:
         """Write an event about the watcher itself."""

@@ -49,6 +49,8 @@ class DiagnosticsOptions:
     )
     worst: Literal["ok", "warn"] = option("ok", "the worst level that is well")
     max_age: float = option(5.0, "how long after an entry it is stale", unit="s")
+    count: int | None = option(None, "how many entries must be meant; any number when absent")
+    absent_ok: bool = option(False, "whether it is well that an entry is not there")
 
     def check(self) -> Iterator[Finding]:
         """Refuse patterns that cannot be read."""
@@ -59,6 +61,8 @@ class DiagnosticsOptions:
                 re.compile(name)
             except re.error as error:
                 yield "names", f"'{name}' is no regular expression: {error}"
+        if self.count is not None and self.count < 1:
+            yield "count", "must be 1 or more"
         if not 0 < self.max_age < inf:
             yield "max_age", "must lie above 0"
 
@@ -91,7 +95,15 @@ def evaluate(config: DiagnosticsOptions, inputs: Sequence[Input], now: Now) -> M
     }
     before = now - round(config.max_age * NS)
     received = inputs[0].flow.age_s(before) <= config.max_age
-    worst = max((_of(pattern, entries) for pattern in config.names), key=lambda e: e.level)
+    found = [_of(pattern, entries) for pattern in config.names]
+    if config.absent_ok:
+        there = [entry for entry in found if entry.level != STALE]
+        found = there or [DiagnosticEntry(OK, "none is there")]
+    if config.count is not None and (received or entries):
+        meant = sum(any(re.search(p, str(name)) for p in config.names) for name in entries)
+        if meant != config.count:
+            found.append(DiagnosticEntry(ERROR, f"{meant} entries, {config.count} expected"))
+    worst = max(found, key=lambda entry: entry.level)
     if worst.level == STALE and not worst.text and not received:
         return {"ok": UNKNOWN}
     text = worst.text or f"no entry for {config.max_age:g} s"

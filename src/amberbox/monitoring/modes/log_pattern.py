@@ -13,7 +13,8 @@ import numpy as np
 from amberbox.core.config import Finding
 from amberbox.core.mode import Input, Result, numbers, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Window
+from amberbox.core.safe_text import one_line
+from amberbox.core.samples import Now, Samples, Window
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -54,6 +55,10 @@ class LogPatternOptions:
     level: float = option(
         -inf, "the least level of a line that counts, where a second input is the level"
     )
+    of: str = option("", "whose lines count, where a third input is the name of who wrote it")
+    silence_ok: bool = option(
+        False, "whether no line at all is well, also before the first one and without a publisher"
+    )
 
     def check(self) -> Iterator[Finding]:
         """Refuse a pattern that cannot be read, and counts that mean nothing."""
@@ -68,6 +73,13 @@ class LogPatternOptions:
 
 
 Config = LogPatternOptions
+_LONGEST = 300  # characters of a line that is quoted
+_SETTLES_S = 1.0  # a log is taken for silent once it was listened to for so long
+
+
+def in_silence(config: LogPatternOptions) -> bool:
+    """Return whether a log without lines is judged, too."""
+    return config.silence_ok
 
 
 def history_s(config: LogPatternOptions) -> float:
@@ -82,7 +94,10 @@ def evaluate(config: LogPatternOptions, inputs: Sequence[Input], now: Now) -> Ma
     count = Window(text, now, config.window).sum_of(flags)
     enough = count >= config.count
     waited = inputs[0].flow.listened(now, config.window)
-    known = (text.last(now) >= 0) & (enough | waited if config.good else True)
+    heard = text.last(now) >= 0
+    if config.silence_ok:
+        heard |= inputs[0].flow.listened(now, min(config.window, _SETTLES_S))
+    known = (heard | enough) & (enough | waited if config.good else True)
     last = np.concatenate([[-1], np.where(flags, np.arange(len(text)), -1)])
     place = np.maximum.accumulate(last)[text.last(now) + 1]
     lines = np.array([*text.values, ""], object)
@@ -98,17 +113,24 @@ def _matching(config: LogPatternOptions, inputs: Sequence[Input]) -> Any:
     pattern, lines = re.compile(config.pattern), inputs[0].samples
     found = [isinstance(line, str) and bool(pattern.search(line)) for line in lines.values]
     flags = np.array(found, bool)
-    if len(inputs) < 2:
-        return flags
-    # Return the level of each line: of several at one time the first belongs to the first.
-    levels = inputs[1].samples
+    if len(inputs) > 1:
+        levels = inputs[1].samples
+        flags &= np.append(numbers(levels.values), np.nan)[_places(lines, levels)] >= config.level
+    if len(inputs) > 2 and config.of:
+        names = inputs[2].samples
+        flags &= np.append(names.values, "")[_places(lines, names)] == config.of
+    return flags
+
+
+def _places(lines: Samples, others: Samples) -> Any:
+    """Return the row of another variable of each line, of several at one time the first for the
+    first; -1 before any.
+    """
     times = lines.times_ns
     rank = np.arange(len(times)) - times.searchsorted(times)
-    place = levels.times_ns.searchsorted(times) + rank
-    at_once = np.append(levels.times_ns, -1)[np.minimum(place, len(levels))] == times
-    last = levels.times_ns.searchsorted(times, "right") - 1
-    place = np.where(at_once, place, last)
-    return flags & (np.append(numbers(levels.values), np.nan)[place] >= config.level)
+    place = others.times_ns.searchsorted(times) + rank
+    at_once = np.append(others.times_ns, -1)[np.minimum(place, len(others))] == times
+    return np.where(at_once, place, others.times_ns.searchsorted(times, "right") - 1)
 
 
 def explain(config: LogPatternOptions, results: Mapping[str, Any]) -> str:
@@ -117,4 +139,5 @@ def explain(config: LogPatternOptions, results: Mapping[str, Any]) -> str:
         return ""
     if config.good:
         return f"no line with '{config.pattern}' for {config.window:g} s"
-    return f"{results['lines']} lines in {config.window:g} s, the last: {results['last_line']}"
+    last = one_line(str(results["last_line"]).rstrip())[:_LONGEST]
+    return f"{results['lines']} lines in {config.window:g} s, the last: {last}"

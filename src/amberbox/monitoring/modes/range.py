@@ -16,6 +16,7 @@ from amberbox.core.mode import (
     Input,
     Result,
     as_single,
+    beyond_limits,
     numbers,
     where_known,
     with_hysteresis,
@@ -76,6 +77,11 @@ def evaluate(config: RangeOptions, inputs: Sequence[Input], now: Now) -> Mapping
     well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)
     in_range = where_known(known, with_hysteresis(well, ~inside))
     return {"in_range": in_range, "value": np.where(known, value, np.nan)}
+
+
+def measure(config: RangeOptions, result: str, inputs: Sequence[str]) -> str:
+    """Return the value minus the limit that it violates."""
+    return beyond_limits(inputs[0], config.min, config.max) if len(inputs) == 1 else ""
 
 
 def reason(config: RangeOptions, given: Given) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from amberbox.core.clock import NS
 from amberbox.core.config import Finding
 from amberbox.core.expression import variable_text
-from amberbox.core.mode import Given, Input, Result, numbers, where_known
+from amberbox.core.mode import Given, Input, Result, beyond_limits, numbers, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 
@@ -62,6 +62,13 @@ class RateOfChangeOptions:
 
 
 Config = RateOfChangeOptions
+
+
+def measure(config: RateOfChangeOptions, result: str, inputs: Sequence[str]) -> str:
+    """Return the change per second minus the limit that it violates."""
+    if len(inputs) != 1 or config.turn is not None:
+        return ""
+    return beyond_limits(f"rate({inputs[0]} over {config.window:g}s)", config.min, config.max)
 
 
 def history_s(config: RateOfChangeOptions) -> float:

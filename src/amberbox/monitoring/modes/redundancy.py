@@ -81,6 +81,15 @@ class RedundancyOptions:
 Config = RedundancyOptions
 
 
+def measure(config: RedundancyOptions, result: str, inputs: Sequence[str]) -> str:
+    """Return the distance of a member from the middle of the others."""
+    place = int(result.removeprefix("member_")) - 1 if result.startswith("member_") else -1
+    if config.formula is not None or not 0 <= place < len(inputs) or len(inputs) < 2:
+        return ""
+    others = ", ".join((*inputs[:place], *inputs[place + 1 :]))
+    return f"{inputs[place]} - {f'median({others})' if len(inputs) > 2 else others}"
+
+
 def reads(config: RedundancyOptions) -> tuple[str, ...]:
     """Return the variables of the formula that are no inputs."""
     return reads_of(config.formula)

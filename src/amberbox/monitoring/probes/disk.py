@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
-from typing import NamedTuple
 
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import UsageError
+from amberbox.core.host import DiskUsage, disk_usage
 from amberbox.core.probe import Measured
 
 MEASURES = {
@@ -20,58 +18,22 @@ MEASURES = {
 SUBJECT = "an absolute path on the disk, such as /data; see mount for what is measured"
 PERIOD_S = 2.0
 
-_ESCAPED = re.compile(r"\\([0-7]{3})")
-
-
-class FileSystemMount(NamedTuple):
-    """Where a file system is mounted, and whether it is read-only itself.
-
-    A service may see a disk through a mount that is read-only for it alone, which does not count.
-    """
-
-    point: Path
-    read_only: bool
-
 
 def measure(subject: str) -> Measured:
     """Measure the disk of a path; it is ok when it can still be written to."""
     path = Path(subject)
     if not path.is_absolute():
         raise UsageError(f"'{subject}' is no absolute path", "begin it with /")
-    found = os.statvfs(path)
-    mounts = Path("/proc/self/mountinfo").read_text(errors="replace")
-    return judge(found, mount_of(path.resolve(), mounts))
+    return judge(disk_usage(path))
 
 
-def judge(found: os.statvfs_result, mount: FileSystemMount) -> Measured:
-    """Return the measurement from the statistics of a file system."""
-    if not found.f_blocks:
-        raise AmberboxError("there is no disk behind it")
-    used = found.f_blocks - found.f_bfree
+def judge(found: DiskUsage) -> Measured:
+    """Return the measurement from the use of a disk."""
     return {
-        "ok": not mount.read_only and found.f_bavail > 0,
-        "used_percent": _percent(used, used + found.f_bavail),
-        "free_bytes": found.f_bavail * found.f_frsize,
-        "inodes_percent": _percent(found.f_files - found.f_ffree, found.f_files),
-        "read_only": mount.read_only,
-        "mount": str(mount.point),
+        "ok": not found.read_only and found.free_bytes > 0,
+        "used_percent": found.used_percent,
+        "free_bytes": found.free_bytes,
+        "inodes_percent": found.inodes_percent,
+        "read_only": found.read_only,
+        "mount": found.mount,
     }
-
-
-def mount_of(path: Path, mountinfo: str) -> FileSystemMount:
-    """Find the mount that a path lies on in ``/proc/self/mountinfo``; of equals the last one."""
-    mounts = [_mount(line) for line in mountinfo.splitlines()]
-    above = [mount for mount in mounts if path.is_relative_to(mount.point)]
-    if not above:
-        raise AmberboxError(f"nothing is mounted at {path}")
-    return max(reversed(above), key=lambda mount: len(mount.point.parts))
-
-
-def _mount(line: str) -> FileSystemMount:
-    fields, _, of_file_system = line.partition(" - ")
-    point = _ESCAPED.sub(lambda code: chr(int(code[1], 8)), fields.split()[4])
-    return FileSystemMount(Path(point), "ro" in of_file_system.split()[-1].split(","))
-
-
-def _percent(part: int, whole: int) -> float | None:
-    return 100 * part / whole if whole else None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from amberbox.core.errors import UsageError
+from amberbox.core.host import link_state, number_in
 from amberbox.core.probe import Measured
 
 MEASURES = {
@@ -17,7 +17,6 @@ MEASURES = {
 }
 SUBJECT = "name of the interface, such as eth0 or can0"
 
-_UP = 0x1  # IFF_UP
 _WORKS = ("up", "unknown")  # drivers without an operating state (CAN, loopback) say unknown
 
 
@@ -33,20 +32,11 @@ def read(root: Path, name: str) -> Measured:
     if name not in [place.name for place in root.iterdir()]:
         return {"ok": False, "state": "absent"}
     place = root / name
-    is_up = bool(int((place / "flags").read_text(), 16) & _UP)
-    carrier = is_up and _number(place / "carrier") == 1
-    state = (place / "operstate").read_text().strip()
-    speed = _number(place / "speed")
-    found: dict[str, Any] = {"ok": carrier and state in _WORKS, "state": state, "carrier": carrier}
-    found["speed_mbit"] = speed if speed is not None and speed > 0 else None
-    for error in ("rx_errors", "tx_errors"):
-        found[error] = _number(place / "statistics" / error)
-    return found
-
-
-def _number(path: Path) -> int | None:
-    """Read a number that drivers may refuse (an interface that is down has no speed)."""
-    try:
-        return int(path.read_text())
-    except (OSError, ValueError):
-        return None
+    link = link_state(place)
+    return {
+        "ok": link.carrier and link.state in _WORKS,
+        "state": link.state,
+        "carrier": link.carrier,
+        "speed_mbit": link.speed_mbit,
+        **{name: number_in(place / "statistics" / name) for name in ("rx_errors", "tx_errors")},
+    }

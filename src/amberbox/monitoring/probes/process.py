@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
-from fnmatch import fnmatchcase
-from itertools import islice
-from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from collections.abc import Mapping
 
 from amberbox.core.errors import UsageError
+from amberbox.core.host import ProcessUsage, find_processes, usage
 from amberbox.core.probe import Measured
 
 MEASURES = {
@@ -26,26 +21,17 @@ SUBJECT = (
 PERIOD_S = 2.0
 
 _WINDOW_S = 0.5
-_RUNS_SCRIPTS = ("python*", "perl*", "bash", "sh", "dash", "ruby", "node")
-_PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
-_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
-
-
-class ProcessUsage(NamedTuple):
-    """The usage of a process: processor time so far, and memory now."""
-
-    cpu_s: float
-    rss_mb: float
 
 
 def measure(subject: str) -> Measured:
     """Find the processes twice, to measure their usage in between."""
-    proc = Path("/proc")
-    pids = find(proc, subject)
-    begin_s, before = time.monotonic(), usage(proc, pids)
+    if not subject.strip():
+        raise UsageError("no process is named", "such as rosmaster")
+    processes = find_processes(subject)
+    begin_s, before = time.monotonic(), usage(processes)
     if before:
         time.sleep(_WINDOW_S)
-    return judge(before, usage(proc, pids), time.monotonic() - begin_s)
+    return judge(before, usage(processes), time.monotonic() - begin_s)
 
 
 def judge(
@@ -59,54 +45,3 @@ def judge(
         "cpu_percent": 100 * cpu_s / seconds if after else None,
         "rss_mb": sum(now.rss_mb for now in after.values()) if after else None,
     }
-
-
-def find(proc: Path, subject: str) -> list[int]:
-    """Return the ids of the processes that are meant, without our own.
-
-    Raises PermissionError when none is found where others' processes are hidden.
-    """
-    if not subject.strip():
-        raise UsageError("no process is named", "such as rosmaster")
-    hidden: list[int] = []
-    own = os.getpid()
-    pids = (int(place.name) for place in proc.iterdir() if place.name.isdecimal())
-    found = [pid for pid in pids if pid != own and _is(proc / str(pid), subject, hidden)]
-    if not found and (hidden or not (proc / "1").exists()):
-        raise PermissionError("processes of other users are hidden (hidepid)")
-    return found
-
-
-def usage(proc: Path, pids: Iterable[int]) -> dict[int, ProcessUsage]:
-    """Read what processes have used; those that have ended are left out."""
-    found: dict[int, ProcessUsage] = {}
-    for pid in pids:
-        with suppress(FileNotFoundError, ProcessLookupError):
-            stat = (proc / str(pid) / "stat").read_text(errors="replace")
-            fields = stat.rpartition(")")[2].split()
-            if fields[0] not in "ZX":  # dead, but not yet reaped by its parent
-                cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S
-                found[pid] = ProcessUsage(cpu_s, int(fields[21]) * _PAGE_MB)
-    return found
-
-
-def _is(place: Path, subject: str, hidden: list[int]) -> bool:
-    try:
-        words = (place / "cmdline").read_bytes().rstrip(b"\0").decode(errors="replace").split("\0")
-        if "*" in subject:
-            return fnmatchcase(" ".join(words), subject)
-        return subject in _names(words) or (place / "comm").read_text().rstrip("\n") == subject
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    except PermissionError:
-        hidden.append(int(place.name))
-        return False
-
-
-def _names(words: list[str]) -> Iterator[str]:
-    """Yield the names of a process: that of its program, and of the script it runs."""
-    program = PurePosixPath(words[0]).name
-    yield program
-    if any(fnmatchcase(program, runner) for runner in _RUNS_SCRIPTS):
-        scripts = (PurePosixPath(word).name for word in words[1:] if not word.startswith("-"))
-        yield from islice(scripts, 1)

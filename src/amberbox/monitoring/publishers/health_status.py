@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from amberbox.core.clock import NS
-from amberbox.core.types import Status
+from amberbox.core.types import Diagnosis, Status
 from amberbox.monitoring.plan import Naming
 
 TYPE = "HEALTH-STATUS"
@@ -23,8 +23,10 @@ MONITOR_METAMODEL = "ropod-component-monitor-schema.json"
 INIT, RUNNING, UNKNOWN = "init", "running", "unknown"
 
 
-def messages(statuses: Sequence[Status], naming: Naming) -> list[dict[str, Any]]:
-    """Return the message of a robot; none where it has no modes."""
+def messages(
+    statuses: Sequence[Status], naming: Naming, diagnosis: Diagnosis | None = None
+) -> list[dict[str, Any]]:
+    """Return the message of a robot, without any diagnosis; none where it has no modes."""
     modes = [status for status in statuses if status.mode]
     components = {status.component: status for status in statuses if not status.mode}
     return [_envelope(modes, components, naming)] if modes else []

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from amberbox.core.types import Status
+from amberbox.core.types import Diagnosis, Status
 from amberbox.monitoring.plan import Naming
 
 
-def messages(statuses: Sequence[Status], naming: Naming) -> list[dict[str, Any]]:
-    """Return one message for each mode; components have none of their own."""
+def messages(
+    statuses: Sequence[Status], naming: Naming, diagnosis: Diagnosis | None = None
+) -> list[dict[str, Any]]:
+    """Return one message for each mode; neither components nor a diagnosis have any."""
     return [message(status, naming) for status in statuses if status.mode]
 
 
