@@ -1,0 +1,1 @@
+"""Detection: learns what is normal from nominal missions, and notices what is not."""
