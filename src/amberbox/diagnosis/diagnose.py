@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal, TypeAlias, cast
@@ -22,7 +22,7 @@ from amberbox.core.contracts import (
 from amberbox.core.errors import AmberboxError, UsageError, did_you_mean
 from amberbox.core.plugins import find, get
 from amberbox.core.timestamps import format_time
-from amberbox.core.types import Diagnosis, Symptom
+from amberbox.core.types import UNKNOWN_FAULT, Diagnosis, Hypothesis, Symptom
 from amberbox.diagnosis.covering.hypotheses import RankedHypotheses, diagnose
 from amberbox.diagnosis.covering.next_test import next_tests, splitting_test, with_answer
 from amberbox.diagnosis.covering.observations import (
@@ -31,8 +31,15 @@ from amberbox.diagnosis.covering.observations import (
     collect_evidence,
     reading_check,
 )
+from amberbox.diagnosis.fmea.findings import COMBINED
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.make_safe import with_safety_actions
+from amberbox.diagnosis.status_history import RecentStatuses
+from amberbox.diagnosis.symptom_presence import PROOF
+
+_OR = " or "
+_READ = ("monitor", "given")
+"""Sources of symptoms that never measure the same; a finding may be of data that they measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,21 +65,64 @@ class ObservedSituation:
         there = (s for s in self.symptoms if s.state == "present" and not s.blocked_by)
         return tuple(sorted(there, key=lambda s: (s.onset_ns or 0, s.id)))
 
-    def with_items(self, items: Iterable[EvidenceItem]) -> ObservedSituation:
-        """Return it with the evidence of a provider, so that one measurement counts once."""
+    def with_items(self, items: Iterable[EvidenceItem], at_ns: int = 0) -> ObservedSituation:
+        """Return it with the evidence that a provider has found at an instant."""
         items = tuple(items)
-        own = [replace(symptom, evidence=measured(symptom)) for symptom in self.symptoms]
-        found = (item for item in items if isinstance(item, Symptom))
         answers = {item.test: item.outcome for item in items if isinstance(item, AnsweredTest)}
-        conflicts = (item.faults for item in items if isinstance(item, Conflict))
         texts = (item.text for item in items if isinstance(item, Finding))
         return replace(
             self,
-            symptoms=(*own, *found),
+            symptoms=(*self.symptoms, *found_symptoms(items, at_ns)),
             answers={**self.answers, **answers},
-            conflicts=(*self.conflicts, *conflicts),
             findings=(*self.findings, *texts),
         )
+
+    def without(self, provider: str) -> ObservedSituation:
+        """Return it without the symptoms that a provider has found."""
+        others = tuple(symptom for symptom in self.symptoms if symptom.source != provider)
+        return replace(self, symptoms=others)
+
+
+def found_symptoms(items: Iterable[EvidenceItem], at_ns: int) -> Iterator[Symptom]:
+    """Yield the symptoms among evidence; a conflict is that of the finding which proves it."""
+    for item in items:
+        if isinstance(item, Symptom):
+            yield item
+        elif isinstance(item, Conflict):
+            name = item.finding or PROOF + _OR.join(sorted(item.faults))
+            yield Symptom(name, "present", name, at_ns, at_ns, source=item.source)
+
+
+def proven_by(knowledge: Knowledge, symptom: Symptom) -> frozenset[str] | None:
+    """Return the failure modes of which a symptom proves that one is present; None if none."""
+    if symptom.id.startswith(PROOF):
+        names = symptom.id.removeprefix(PROOF).split(_OR)
+        faults = frozenset(fault for name in names for fault in _faults_of(knowledge, name))
+        return faults | _unlisted_with(knowledge, faults)
+    return knowledge.proven.get(symptom.id)
+
+
+def _unlisted_with(knowledge: Knowledge, faults: frozenset[str]) -> frozenset[str]:
+    """Return what is not in the FMEA of the components of faults, if a fault may be unknown."""
+    if UNKNOWN_FAULT not in faults:
+        return frozenset()
+    components = {fault.partition("#")[0] for fault in faults}
+    modes = knowledge.model.modes
+    return frozenset(m.id for m in modes if m.is_unlisted and m.component in components)
+
+
+def suspicion(components: Iterable[str]) -> str:
+    """Return the id of the symptom that one of some components is faulty."""
+    return PROOF + _OR.join(sorted(components))
+
+
+def _faults_of(knowledge: Knowledge, name: str) -> Iterator[str]:
+    """Yield a failure mode; those of a component, with what is not in the FMEA."""
+    if "#" in name:
+        yield name
+        return
+    yield from (mode.id for mode in knowledge.model.modes if mode.component == name)
+    yield UNKNOWN_FAULT
 
 
 # What was measured: address, from and to in nanoseconds
@@ -88,13 +138,43 @@ def measured(symptom: Symptom) -> Measured:
     return ((symptom.address or symptom.id, from_ns or 0, to_ns or 0),)
 
 
+def _proofs(knowledge: Knowledge, situation: ObservedSituation) -> dict[str, frozenset[str]]:
+    """Return what present findings prove: the failure modes of which one is there, by finding."""
+    found = {symptom.id: proven_by(knowledge, symptom) for symptom in situation.present()}
+    return {name: faults for name, faults in found.items() if faults}
+
+
+def _suspicions(
+    knowledge: Knowledge, situation: ObservedSituation
+) -> dict[str, tuple[frozenset[str], float]]:
+    """Return the conflicts that are only as sure as the finding they are of, by its name."""
+    return {
+        symptom.id: (faults, symptom.strength)
+        for symptom in situation.present()
+        if symptom.strength < 1.0 and symptom.id.startswith(PROOF)
+        and (faults := proven_by(knowledge, symptom))
+    }  # fmt: skip
+
+
 def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) -> Evidence:
     """Return the evidence of a situation that counts.
 
     Raises UsageError for an answer to an unknown test, or an unknown answer.
     """
-    counting = (_as_monitored(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
-    found = collect_evidence(counting, situation.conflicts)
+    counting = [_as_monitored(symptom) for symptom in situation.symptoms if not symptom.blocked_by]
+    suspicions = _suspicions(knowledge, situation)
+    proofs = [
+        faults for name, faults in _proofs(knowledge, situation).items() if name not in suspicions
+    ]
+    conflicts = dict.fromkeys((*situation.conflicts, *proofs))
+    counting = [symptom for symptom in counting if proven_by(knowledge, symptom) is None]
+    if any(symptom.state == "present" and symptom.source in _READ for symptom in counting):
+        # what monitors show may have effects in items that the FMEA does not list
+        counting = [symptom for symptom in counting if not symptom.id.startswith(COMBINED)]
+    if any(symptom.source not in _READ for symptom in counting):
+        counting = [replace(symptom, evidence=measured(symptom)) for symptom in counting]
+    found = collect_evidence(counting, conflicts, knowledge.level)
+    found = replace(found, suspicions=tuple(suspicions.values()))
     if situation.watched:
         read = frozenset(f"read:{sign.id}" for sign in knowledge.model.signs)
         found = replace(found, asked=found.asked | read)
@@ -109,6 +189,15 @@ def _as_monitored(symptom: Symptom) -> Symptom:
     The author of the file has given both a ``detects``, knowing that they use the same measurement.
     """
     return replace(symptom, source="monitor") if symptom.source == "condition" else symptom
+
+
+def is_answer(knowledge: Knowledge, test: str, answer: str) -> bool:
+    """Return whether a test exists and gives such an answer."""
+    try:
+        with_answer(Evidence(), check_named(knowledge, test), answer)
+    except UsageError:
+        return False
+    return True
 
 
 def check_named(knowledge: Knowledge, test: str) -> Check:
@@ -172,7 +261,8 @@ def build_diagnosis(
     effort: Effort,
 ) -> Diagnosis:
     """Return the diagnosis that an engine's answer makes, with the tests to do next."""
-    model, hypotheses = knowledge.model, found.hypotheses
+    model, proofs = knowledge.model, _proofs(knowledge, situation)
+    hypotheses = tuple(_with_proofs(hypothesis, proofs) for hypothesis in found.hypotheses)
     checks = tuple(knowledge.checks.values())
     tests = next_tests(model, known, hypotheses, checks, most=effort.tests)
     groups = []
@@ -197,6 +287,12 @@ def build_diagnosis(
     )
 
 
+def _with_proofs(hypothesis: Hypothesis, proofs: Mapping[str, frozenset[str]]) -> Hypothesis:
+    """Return a hypothesis that explains the findings that prove one of its failure modes."""
+    names = tuple(name for name, faults in proofs.items() if faults & hypothesis.faults)
+    return replace(hypothesis, explains=(*hypothesis.explains, *names)) if names else hypothesis
+
+
 # Origin of the symptoms: the watcher's journal, an evaluation, the user alone; or only the
 # watcher's statuses, as on a server (they have no conditions)
 Origin: TypeAlias = Literal["watcher", "record", "given", "status"]
@@ -207,7 +303,8 @@ class DiagnosisContext:
     """The evidence at an instant, and the last revision of a diagnosis up to then, if any.
 
     ``seen`` are the symptoms of that diagnosis at its time; they need not be present any more.
-    ``has_more``: there is more evidence than that diagnosis used.
+    ``has_more``: there is more evidence than that diagnosis used. ``statuses`` are the latest ones
+    of components, where a tracker knows them.
     """
 
     at_ns: int
@@ -216,6 +313,7 @@ class DiagnosisContext:
     origin: Origin = "given"
     seen: tuple[Symptom, ...] = ()
     has_more: bool = False
+    statuses: RecentStatuses | None = None
 
     @property
     def is_over(self) -> bool:
@@ -226,6 +324,22 @@ class DiagnosisContext:
     def open(self) -> Diagnosis | None:
         """Return the open diagnosis; None without one."""
         return None if self.is_over else self.last_diagnosis
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Return the providers whose findings are among the evidence of the last diagnosis."""
+        if self.has_more or self.last_diagnosis is None:
+            return ()
+        return self.last_diagnosis.asked
+
+    @property
+    def found_by_watcher(self) -> tuple[str, ...]:
+        """Return the providers whose findings are among the symptoms, whatever a user adds."""
+        return () if self.last_diagnosis is None else self.last_diagnosis.asked
+
+    def without(self, provider: str) -> DiagnosisContext:
+        """Return the context without the symptoms that a provider has found."""
+        return replace(self, situation=self.situation.without(provider))
 
     def with_observations(self, items: Sequence[EvidenceItem]) -> DiagnosisContext:
         """Return the context with the user's evidence, which replaces the symptoms that were read.
@@ -254,7 +368,7 @@ class DiagnosisContext:
 
         Texts alone indicate no failure mode: they are added to the last diagnosis.
         """
-        known = replace(self, situation=self.situation.with_items(items))
+        known = replace(self, situation=self.situation.with_items(items, self.at_ns))
         texts = [item.text for item in items if isinstance(item, Finding)]
         if len(texts) < len(items):
             return replace(known, last_diagnosis=self.open, has_more=True)
@@ -334,7 +448,7 @@ def observe(
     knowledge: Knowledge, context: DiagnosisContext, window: OpenWindow
 ) -> DiagnosisContext:
     """Return a context with evidence of providers that need no symptoms; raises their errors."""
-    for provider in _providers().values():
+    for provider in evidence_providers().values():
         opened = window(context)
         needs = provider.needs(knowledge, opened.folder)
         if needs is not None and not needs.symptoms:
@@ -351,17 +465,24 @@ def diagnose_with_evidence(
 ) -> tuple[DiagnosisContext, Diagnosis | None]:
     """Add the evidence of providers that need symptoms, and return an engine's diagnosis.
 
-    An engine that answers alone is not called for evidence before. Returns the context with the
-    evidence, and None where nothing is wrong. A provider that fails is left out and named in
-    ``left_out``; without that list its error is raised.
+    An engine that answers alone is not called for evidence before, nor is a provider that the
+    tracker has asked: its findings are among the symptoms. Returns the context with the evidence,
+    and None where nothing is wrong. A provider that fails is left out and named in ``left_out``;
+    without that list its error is raised. What the watcher found is answered again where the
+    exposure is not the file's.
     """
-    for name, provider in _providers().items():
-        if name == engine:
+    if knowledge.exposure_h is not None and context.origin == "watcher" and context.open:
+        context = replace(context, has_more=True)
+    for name, provider in evidence_providers().items():
+        if name in (engine, *context.asked):
             continue
         try:
             opened = window(context)
             needs = provider.needs(knowledge, opened.folder)
-            if needs is not None and needs.symptoms:
+            if needs is None or not needs.symptoms:
+                continue
+            if needs.reads_symptoms or name not in context.found_by_watcher:
+                opened = window(context := context.without(name))
                 context = context.with_items(tuple(provider.provide(knowledge, opened)))
         except AmberboxError as error:
             if left_out is None:
@@ -375,6 +496,7 @@ def diagnose_with_evidence(
     return context, None if made is None else with_safety_actions(knowledge.fmea, made)
 
 
-def _providers() -> dict[str, EvidenceProvider[Knowledge]]:
+def evidence_providers() -> dict[str, EvidenceProvider[Knowledge]]:
+    """Return the providers that are asked for an instant, by name."""
     found = find(EVIDENCE, defines=("needs", "provide"))
     return {name: cast("EvidenceProvider[Knowledge]", of.load()) for name, of in found.items()}

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from amberbox.core.robot_status import SEVERITIES
-from amberbox.core.types import FaultFacts
-from amberbox.diagnosis.covering.model import Function, Link, Mode, Model, Sign, Unknown
+from amberbox.core.types import FaultFacts, Symptom
+from amberbox.diagnosis.covering.model import (
+    Consequence,
+    Function,
+    Link,
+    Mode,
+    Model,
+    Sign,
+    Unknown,
+)
 from amberbox.diagnosis.covering.observations import Check, CheckDetection
 from amberbox.diagnosis.fmea.criticality import mode_criticality
-from amberbox.diagnosis.fmea.findings import finding_signs
+from amberbox.diagnosis.fmea.findings import finding_signs, proven_faults
 from amberbox.diagnosis.fmea.model import DependencyStructure, Fmea
+
+MOST_UNLISTED = 0.5  # a fault of unknown kind is not more probable, and shows nothing more surely
 
 
 def compile_model(fmea: Fmea, exposure_h: float | None = None) -> Model:
@@ -26,11 +36,16 @@ def compile_model(fmea: Fmea, exposure_h: float | None = None) -> Model:
             mode.chance(exposure_h),
             mode.takes_down,
             mode_criticality(mode, exposure_h),
+            mode.excludes,
         )
         for mode in fmea.modes.values()
     )
-    signs = tuple(Sign(symptom.id, symptom.leak) for symptom in fmea.symptoms.values())
+    signs = tuple(
+        Sign(symptom.id, symptom.leak, bins=symptom.scale.bins if symptom.scale else 0)
+        for symptom in fmea.symptoms.values()
+    )
     found, found_links = finding_signs(fmea)
+    unlisted, unlisted_links = _unlisted(fmea, modes)
     functions = tuple(Function(name, needs) for name, needs in fmea.needs().items())
     other = Unknown(
         fmea.other.probability,
@@ -38,7 +53,59 @@ def compile_model(fmea: Fmea, exposure_h: float | None = None) -> Model:
         looks_like=fmea.other.looks_like,
         together_s=fmea.other.together_s,
     )
-    return Model(modes, signs + found, (*_links(fmea), *found_links), functions, other)
+    follows = tuple(
+        Consequence(mode.id, one.mode, one.p, one.after_s)
+        for mode in fmea.modes.values()
+        for one in mode.leads_to
+    )
+    links = (*_links(fmea), *found_links, *unlisted_links)
+    return Model((*modes, *unlisted), signs + found, links, functions, other, follows)
+
+
+def _unlisted(fmea: Fmea, modes: Sequence[Mode]) -> tuple[list[Mode], list[Link]]:
+    """Return for each component modes for its faults that are not in the FMEA, and their links.
+
+    All of these are a share of the component's faults, one mode for each number of symptoms. They
+    show the symptoms that its failure modes show, each the more probably, the more surely one of
+    these shows it; any size. What detectors find in an item in which these show speaks for them,
+    too. Conditions that no failure mode shows of the components that need it are together as
+    probable as one such condition of its own.
+    """
+    other = fmea.other
+    if not other.share:
+        return [], []
+    is_exclusive = any(mode.excludes for mode in modes)
+    unshown, below = fmea.unshown(), fmea.unshown_below()
+    made: list[Mode] = []
+    links: list[Link] = []
+    for component in dict.fromkeys(mode.component for mode in modes):
+        own = [mode for mode in modes if mode.component == component]
+        ids = {mode.id for mode in own}
+        showing = (of.finding for of in fmea.unusual if not ids.isdisjoint(of.maps_to))
+        unusual = dict.fromkeys(showing)
+        prior = sum(mode.prior for mode in own) * other.share / (1.0 - other.share)
+        prior = min(prior / len(other.shows), MOST_UNLISTED)
+        named = [f"{component}# shows {number:g}" for number in dict.fromkeys(other.shows)]
+        excludes = frozenset((*named, *(mode.id for mode in own)) if is_exclusive else ())
+        most: dict[str, float] = {}
+        for mode in own:
+            for link in fmea.modes[mode.id].symptoms:
+                most[link.symptom] = max(most.get(link.symptom, 0.0), link.detects)
+        most.update(dict.fromkeys(unshown.get(component, ()), 1.0))
+        for name, number in zip(named, dict.fromkeys(other.shows), strict=True):
+            made.append(Mode(name, prior, excludes=excludes, is_unlisted=True))
+            each = number / (sum(most.values()) or 1.0)
+            links += [Link(name, finding, MOST_UNLISTED) for finding in unusual]
+            links += [
+                Link(name, symptom, min(MOST_UNLISTED, each * detects))
+                for symptom, detects in most.items()
+            ]
+            of_users = below.get(component, ())
+            links += [
+                Link(name, symptom, min(MOST_UNLISTED, each) / len(of_users))
+                for symptom in of_users
+            ]
+    return made, links
 
 
 def _links(fmea: Fmea) -> Iterator[Link]:
@@ -46,7 +113,9 @@ def _links(fmea: Fmea) -> Iterator[Link]:
     causes += [(function.id, function.symptoms) for function in fmea.functions.values()]
     for cause, links in causes:
         for link in links:
-            yield Link(cause, link.symptom, link.detects)
+            scale = fmea.symptoms[link.symptom].scale
+            sizes = scale.shares(link.size) if scale and link.size else ()
+            yield Link(cause, link.symptom, link.detects, sizes, link.after_s)
 
 
 def compile_checks(fmea: Fmea) -> tuple[Check, ...]:
@@ -66,6 +135,8 @@ def compile_checks(fmea: Fmea) -> tuple[Check, ...]:
             test.outcomes,
             test.sure,
             tuple(detections[test.id]),
+            run=test.run,
+            moves=test.moves,
         )
         for test in fmea.tests.values()
     )
@@ -88,6 +159,16 @@ class Knowledge:
     def model(self) -> Model:
         """Return the model of the covering engine."""
         return compile_model(self.fmea, self.exposure_h)
+
+    @cached_property
+    def proven(self) -> Mapping[str, frozenset[str]]:
+        """Return the failure modes of which one is present, by the finding that proves it."""
+        return proven_faults(self.fmea)
+
+    def level(self, symptom: Symptom) -> int | None:
+        """Return the level of a present symptom's size; None if it has none."""
+        known = self.fmea.symptoms.get(symptom.id)
+        return known.scale.level(symptom.size) if known and known.scale else None
 
     def facts(self, shows: Mapping[str, Collection[str]]) -> Mapping[str, FaultFacts]:
         """Return the severity of each failure mode alone, and the symptoms it shows.

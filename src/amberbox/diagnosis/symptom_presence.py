@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.needs import Needs
 from amberbox.core.types import Symptom
+from amberbox.diagnosis.fmea.findings import RULE, finding_holds
 from amberbox.diagnosis.fmea.model import DependencyStructure, Fmea, SymptomLink
+
+PROOF: Final = "one of "
+"""Begins the name of a conflict that no finding of the analysis proves."""
 
 
 def components_by_symptom(fmea: Fmea) -> dict[str, frozenset[str]]:
@@ -51,6 +55,10 @@ class BlockingRules:
         self._by_itself = {name for name, symptom in fmea.symptoms.items() if symptom.by_itself}
         self._shown_by = components_by_symptom(fmea)
         self._down = _down(fmea)
+
+    def is_evidence_by_itself(self, name: str) -> bool:
+        """Return whether a symptom, and its absence, count whatever its component waits for."""
+        return name in self._by_itself
 
     def lets_count(self, latest: Symptom, present: Collection[str]) -> bool:
         """Return whether a symptom counts that appears while these others are present.
@@ -95,9 +103,10 @@ Counts: TypeAlias = Literal["present", "absent", ""]
 class SymptomPresence:
     """One symptom: its latest finding, and when it appeared and disappeared.
 
-    ``seen`` is the finding when it appeared. After it is observed to be gone it is remembered for
-    ``hold_ns``, that is until ``until_ns``, and only ``within_ns`` later it can count as absent.
-    While it cannot be evaluated, ``left_ns`` of that time remain, for ``remember_ns`` at most.
+    ``seen`` is the finding when it appeared, with the latest size that was found since. After it is
+    observed to be gone it is remembered for ``hold_ns``, that is until ``until_ns``, and only
+    ``within_ns`` later it can count as absent. While it cannot be evaluated, ``left_ns`` of that
+    time remain, for ``remember_ns`` at most.
     """
 
     latest: Symptom
@@ -123,7 +132,9 @@ class SymptomPresence:
         was_present = self.counts_present(at_ns)
         self.latest = latest
         if latest.state == "present" and (was_present or counts):
-            self.seen = self.seen if was_present else latest
+            self.seen = self.seen if self.seen and was_present else latest
+            if latest.size is not None:
+                self.seen = replace(self.seen, size=latest.size)
             self.until_ns = self.left_ns = None
         elif was_present and self.is_absent:
             if self.until_ns is None:
@@ -200,6 +211,8 @@ class SymptomPresences:
 
     def __init__(self, fmea: Fmea) -> None:
         self._symptoms = fmea.symptoms
+        holds = finding_holds(fmea)
+        self._findings = {name: holds[name] for name in holds if name not in fmea.symptoms}
         self._remember_ns = round(fmea.remember_s * NS)
         self._blocking = BlockingRules(fmea)
         self._all: dict[str, SymptomPresence] = {}
@@ -211,11 +224,17 @@ class SymptomPresences:
         self._blocked.clear()
 
     def knows(self, name: str) -> bool:
-        """Return whether the analysis has a symptom."""
-        return name in self._symptoms
+        """Return whether the analysis has a symptom, or a finding that is evidence."""
+        return name in self._symptoms or self.is_finding(name)
+
+    def is_finding(self, name: str) -> bool:
+        """Return whether it is a finding: it is evidence only while it is present."""
+        return name in self._findings or name.startswith(PROOF)
 
     def take(self, latest: Symptom, at_ns: int) -> None:
-        """Process the finding of a symptom at an instant."""
+        """Process a finding at an instant; a symptom that counts by itself is never blocked."""
+        if latest.blocked_by and self._blocking.is_evidence_by_itself(latest.id):
+            latest = replace(latest, blocked_by=())
         presence = self._all.get(latest.id)
         if presence is None:
             presence = self._all[latest.id] = self._made(latest)
@@ -228,6 +247,8 @@ class SymptomPresences:
         """Process a finding; a blocked one is processed again when more symptoms are present."""
         there = [name for name, one in self if one.is_there] if latest.blocked_by else ()
         presence.take(latest, at_ns, self._blocking.lets_count(latest, there))
+        if presence.seen is not None and presence.is_there and self.is_finding(latest.id):
+            presence.seen = replace(latest, onset_ns=presence.seen.onset_ns)
         if latest.state == "present" and not presence.is_there:
             self._blocked[latest.id] = None
         else:
@@ -237,7 +258,9 @@ class SymptomPresences:
         """Create the presence of a symptom, with its hold time and its longest delay."""
         symptom = self._symptoms.get(latest.id)
         if symptom is None:
-            return SymptomPresence(latest)
+            hold_ns = round(self._findings.get(latest.id, 0.0) * NS)
+            is_remembered = latest.id in self._findings and not latest.id.startswith(RULE)
+            return SymptomPresence(latest, hold_ns, 0, self._remember_ns if is_remembered else 0)
         hold_ns, within_ns = round(symptom.hold_s * NS), round(symptom.within_s * NS)
         return SymptomPresence(latest, hold_ns, within_ns, self._remember_ns)
 
@@ -258,11 +281,18 @@ class SymptomPresences:
             if self.knows(name) and one.counts_present(at_ns)
         }
 
+    def levels(
+        self, names: Iterable[str], level_of: Callable[[Symptom], int | None]
+    ) -> dict[str, int]:
+        """Return the levels of the sizes of some symptoms, where they are known."""
+        found = {name: level_of(self._all[name].shown("present")) for name in names}
+        return {name: level for name, level in found.items() if level is not None}
+
     def counting(self, at_ns: int, waits_ns: Mapping[str, int]) -> dict[str, Counts]:
         """Return what each symptom counts as at an instant.
 
-        Absence counts from the instant in ``waits_ns`` on. Symptoms that are not in the FMEA count
-        only while they are present.
+        Absence counts from the instant in ``waits_ns`` on. Findings, and symptoms that are not in
+        the FMEA, count only while they are present.
         """
         return {name: self._counts(name, one, at_ns, waits_ns) for name, one in self}
 
@@ -272,7 +302,7 @@ class SymptomPresences:
         if one.counts_present(at_ns):
             return "present"
         since_ns = max(one.may_be_absent_ns, waits_ns.get(name, 0))
-        return "absent" if one.is_absent and self.knows(name) and at_ns >= since_ns else ""
+        return "absent" if one.is_absent and name in self._symptoms and at_ns >= since_ns else ""
 
     def next_ns(self, at_ns: int, waits_ns: Mapping[str, int]) -> int | None:
         """Return when (ns) a symptom counts otherwise without a new finding; None for never."""
@@ -307,12 +337,14 @@ class SymptomPresences:
 class AbsenceTimes:
     """The causes of each symptom, and the longest delay of each.
 
-    Causes are failure modes and lost functions. Functions that need a component that a mode takes
-    down, directly or not, count as effects of the mode, regardless of redundancy.
+    Causes are failure modes, lost functions, and the faults of each component that are not in the
+    FMEA. Functions that need a component that a mode takes down, directly or not, count as effects
+    of the mode, regardless of redundancy.
     """
 
     def __init__(self, fmea: Fmea) -> None:
-        self._links = {cause: _slowest(links) for cause, links in _causes(fmea)}
+        self._shows = {cause: _slowest(links) for cause, links in _causes(fmea)}
+        self._links = self._shows | dict(_unlisted(fmea))
         self._causes: dict[str, list[str]] = {}
         for cause, links in self._links.items():
             for symptom in links:
@@ -320,8 +352,8 @@ class AbsenceTimes:
 
     @property
     def shows(self) -> Mapping[str, Collection[str]]:
-        """Return the symptoms of each cause."""
-        return {cause: links.keys() for cause, links in self._links.items()}
+        """Return the symptoms of each failure mode and of each lost function."""
+        return {cause: links.keys() for cause, links in self._shows.items()}
 
     def until_ns(self, onsets_ns: Mapping[str, int]) -> dict[str, int]:
         """Return until when to wait for absent symptoms, given the present ones.
@@ -348,6 +380,21 @@ def _causes(fmea: Fmea) -> Iterator[tuple[str, list[SymptomLink]]]:
     for function in fmea.functions.values():
         if function.symptoms:
             yield function.id, _shown_below(fmea, structure, function.id)
+
+
+def _unlisted(fmea: Fmea) -> Iterator[tuple[str, dict[str, int]]]:
+    """Yield the symptoms of each component's faults that are not in the FMEA, and how late."""
+    if not fmea.other.share:
+        return
+    links: dict[str, list[SymptomLink]] = {}
+    for mode in fmea.modes.values():
+        links.setdefault(mode.component, []).extend(mode.symptoms)
+    unshown, below = fmea.unshown(), fmea.unshown_below()
+    for component, own in links.items():
+        slowest = _slowest(own)
+        for name in (*unshown.get(component, ()), *below.get(component, ())):
+            slowest[name] = round(fmea.symptoms[name].within_s * NS)
+        yield f"{component}# not in the FMEA", slowest
 
 
 def _shown_below(fmea: Fmea, structure: DependencyStructure, name: str) -> list[SymptomLink]:

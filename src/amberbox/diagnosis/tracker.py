@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from heapq import merge
 from itertools import groupby
+from types import CodeType
 from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
@@ -14,8 +17,20 @@ import msgspec
 from amberbox.core.clock import NS
 from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
+from amberbox.core.given_answers import ITEM as ANSWERS
+from amberbox.core.given_answers import RecordedAnswer, answers_in
 from amberbox.core.types import Batch, Diagnosis, FaultFacts, Symptom
-from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer, followers
+from amberbox.diagnosis.asked_evidence import AskedEvidence
+from amberbox.diagnosis.diagnose import (
+    DiagnosisId,
+    Effort,
+    ObservedSituation,
+    OpenWindow,
+    answer,
+    followers,
+    is_answer,
+)
+from amberbox.diagnosis.fmea.findings import faults_by_finding
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.symptom_presence import (
     AbsenceTimes,
@@ -39,9 +54,10 @@ class OpenDiagnosis:
     """A diagnosis from its first symptom until all have healed.
 
     ``evidence`` is what its last answer took into account, as far as it still counts; ``had`` are
-    symptoms that have counted as present.
+    symptoms that have counted as present. ``answers`` are what people answered to its tests.
     ``waiting`` are symptoms that it had and that have not been seen absent since.
-    ``quiet_since_ns`` is since when none is present; None while one is.
+    ``quiet_since_ns`` is since when none is present; None while one is. ``levels`` are those of the
+    sizes that its last answer took into account, and ``texts`` the findings that were shown in it.
     """
 
     id: str
@@ -50,6 +66,11 @@ class OpenDiagnosis:
     waiting: set[str] = field(default_factory=set)
     quiet_since_ns: int | None = None
     had: set[str] = field(default_factory=set)
+    answers: dict[str, str] = field(default_factory=dict)
+    has_new_answers: bool = False
+    levels: dict[str, int] = field(default_factory=dict)
+    texts: tuple[str, ...] = ()
+    asked_answers: dict[str, str] = field(default_factory=dict)
 
     @property
     def next_revision(self) -> int:
@@ -101,6 +122,11 @@ class OpenDiagnosis:
             "waiting": sorted(self.waiting),
             "quiet_since_ns": self.quiet_since_ns,
             "had": sorted(self.had),
+            "answers": self.answers,
+            "has_new_answers": self.has_new_answers,
+            "levels": self.levels,
+            "texts": self.texts,
+            "asked_answers": self.asked_answers,
         }
 
     @classmethod
@@ -146,10 +172,21 @@ NEVER_NS = 1 << 62
 
 
 class RepairDetection:
-    """Detects failure modes that have ended; ``shows`` are the symptoms of each."""
+    """Detects failure modes that have ended; ``shows`` are the symptoms of each.
 
-    def __init__(self, shows: Mapping[str, Collection[str]]) -> None:
+    ``found`` are their findings: as long as one is present, its failure modes are not over.
+    """
+
+    def __init__(
+        self,
+        shows: Mapping[str, Collection[str]],
+        found: Iterable[tuple[str, Iterable[str]]] = (),
+    ) -> None:
         self._shows = shows
+        self._found: dict[str, list[str]] = {}
+        for finding, faults in found:
+            for fault in faults:
+                self._found.setdefault(fault, []).append(finding)
 
     def ends_ns(
         self, faults: Iterable[str], had: Collection[str], presences: SymptomPresences, at_ns: int
@@ -164,6 +201,11 @@ class RepairDetection:
         for fault in faults:
             names = [n for n in self._shows.get(fault, ()) if n in had and n in presences]
             over_ns = _over_ns([presences[name] for name in names], at_ns)
+            if any(
+                name in presences and presences[name].counts_present(at_ns)
+                for name in self._found.get(fault, ())
+            ):
+                over_ns = NEVER_NS
             for name in names:
                 ends_ns[name] = max(ends_ns.get(name, 0), over_ns)
         return {name: end_ns for name, end_ns in ends_ns.items() if end_ns < NEVER_NS}
@@ -190,7 +232,9 @@ class RepairDetection:
 
     def _is_over(self, fault: str, present: Collection[str]) -> bool:
         shows = self._shows.get(fault)
-        return shows is not None and not any(name in present for name in shows)
+        return shows is not None and not any(
+            name in present for names in (shows, self._found.get(fault, ())) for name in names
+        )
 
 
 def _over_ns(shown: Collection[SymptomPresence], at_ns: int) -> int:
@@ -212,25 +256,32 @@ Out: TypeAlias = "list[Symptom | Diagnosis]"
 
 
 class FaultTracker:
-    """Tracks the faults of one robot: ``begin`` an epoch, ``feed`` rows, ``advance``."""
+    """Tracks the faults of one robot: ``begin`` an epoch, ``feed`` rows, ``advance``.
 
-    def __init__(self, knowledge: Knowledge) -> None:
+    ``open_window`` opens folder and record for the providers that are asked at instants; without it
+    only evidence that is followed counts.
+    """
+
+    def __init__(self, knowledge: Knowledge, open_window: OpenWindow | None = None) -> None:
         self.knowledge = knowledge
         self._followers = followers(knowledge)
+        self._asked = AskedEvidence(knowledge, open_window)
         self._presences = SymptomPresences(knowledge.fmea)
         self._waits = AbsenceTimes(knowledge.fmea)
-        self._repairs = RepairDetection(self._waits.shows)
+        self._repairs = RepairDetection(self._waits.shows, faults_by_finding(knowledge.fmea))
         self._waits_ns: dict[str, int] = {}
         self._until_ns = 0
         self._pending: list[Symptom] = []
         self._opening: OpenDiagnosis | None = None
         self._last_id = ""
         self._due_ns: int | None = None
+        self._answers: deque[tuple[int, RecordedAnswer]] = deque()
 
     @property
     def items(self) -> frozenset[str]:
         """Return the names of the items whose rows evidence is read from."""
-        return frozenset[str]().union(*(one.items for one in self._followers.values()))
+        own = {ANSWERS} if self.knowledge.checks else set[str]()
+        return frozenset(own).union(*(one.items for one in self._followers.values()))
 
     @property
     def history_s(self) -> float:
@@ -247,6 +298,16 @@ class FaultTracker:
         """Return the conditions whose last evaluation failed, with the reason."""
         return {name: why for of in self._followers.values() for name, why in of.troubles.items()}
 
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Return the providers that have failed and are left out for now, with the reason."""
+        return self._asked.left_out
+
+    @property
+    def guarded(self) -> frozenset[CodeType]:
+        """Return the code of the providers that are asked, which must return soon."""
+        return self._asked.codes
+
     def begin(self, at_ns: int) -> None:
         """Begin an epoch: nothing is known; a diagnosis that is open stays open.
 
@@ -256,16 +317,20 @@ class FaultTracker:
         self._presences.begin()
         self._waits_ns = {}
         self._until_ns = at_ns
-        self._due_ns = None
+        self._answers.clear()
+        self._asked.begin(at_ns)
+        self._due_ns = _half_from_any([self._asked.next_ns(at_ns)])
         if self._opening is not None:
             self._opening.evidence = {}
             self._opening.quiet_since_ns = at_ns
-            self._due_ns = _half_from(at_ns + FORGOTTEN_NS)
+            self._due_ns = self._next_ns(self._opening, at_ns)
 
     def feed(self, batch: Batch) -> None:
         """Take rows of any item; log times do not decrease."""
         for one in self._followers.values():
             one.feed(batch)
+        if batch.item == ANSWERS:  # those up to the last instant have been taken
+            self._answers += (given for given in answers_in(batch) if given[0] > self._until_ns)
 
     def advance(self, found: Sequence[object], until_ns: int) -> list[Symptom | Diagnosis]:
         """Return the findings up to an instant, for which the record must be complete.
@@ -276,6 +341,7 @@ class FaultTracker:
         written: list[list[Event]] = []
         unwritten = [_timed(self._pending, records=True)]
         self._pending = []
+        self._asked.receive(found)
         for one in self._followers.values():
             one.receive(found)
             changes = _timed(one.advance(self._until_ns, until_ns), records=one.records)
@@ -286,6 +352,7 @@ class FaultTracker:
             self._look_before(at_ns, out)
             self._take(group, at_ns, out)
         self._look_before(until_ns + 1, out)
+        self._asked.forget_before(until_ns)
         self._until_ns = max(self._until_ns, until_ns)
         return out
 
@@ -303,7 +370,9 @@ class FaultTracker:
             for name, counts in counting.items()
             if counts == "present" or self._presences.knows(name)
         ]
-        return ObservedSituation(tuple(shown), watched=True)
+        given = {} if self._opening is None else self._opening.answers
+        answers = {**self._asked.answers, **given}
+        return ObservedSituation(tuple(shown), answers, watched=True, findings=self._asked.texts)
 
     def _take(
         self,
@@ -315,29 +384,81 @@ class FaultTracker:
         for _, records, symptom in events:
             if records:
                 out.append(symptom)
-            self._presences.take(symptom, at_ns)
-            if self._opening is not None:
-                if self._presences[symptom.id].is_there and self._presences.knows(symptom.id):
-                    self._opening.waiting.add(symptom.id)
-                elif self._presences[symptom.id].is_absent:
-                    self._opening.waiting.discard(symptom.id)
-        onsets_ns = self._presences.onsets(at_ns)
+            self._take_symptom(symptom, at_ns)
         if self._opening is not None:
             self._due_ns = _half_from(at_ns)
             if self._due_ns == at_ns:
                 self._look(at_ns, out)
-        elif onsets_ns:
-            name = new_diagnosis_id(self.knowledge.robot, at_ns, self._last_id)
-            self._opening = OpenDiagnosis(name, waiting=set(onsets_ns))
-            self._last_id = name
-            self._look(at_ns, out)
+        elif not self._open(at_ns, out) and self._asked.is_used:
+            self._due_ns = _half_from_any([at_ns, self._due_ns])
+
+    def _take_symptom(self, symptom: Symptom, at_ns: int) -> None:
+        self._presences.take(symptom, at_ns)
+        if self._opening is not None:
+            if self._presences[symptom.id].is_there and self._presences.knows(symptom.id):
+                self._opening.waiting.add(symptom.id)
+            elif self._presences[symptom.id].is_absent:
+                self._opening.waiting.discard(symptom.id)
+
+    def _open(self, at_ns: int, out: Out) -> bool:
+        """Open a diagnosis if a symptom is present, and look at it; return whether one is."""
+        onsets_ns = self._presences.onsets(at_ns)
+        if not onsets_ns:
+            return False
+        name = new_diagnosis_id(self.knowledge.robot, at_ns, self._last_id)
+        self._opening = OpenDiagnosis(name, waiting=set(onsets_ns))
+        self._last_id = name
+        self._look(at_ns, out)
+        return True
 
     def _look_before(self, before_ns: int, out: Out) -> None:
         """Evaluate at each instant before ``before_ns`` at which the evidence changes without new
         findings.
         """
-        while self._due_ns is not None and self._due_ns < before_ns:
-            self._look(self._due_ns, out)
+        while True:
+            due_ns = NEVER_NS if self._due_ns is None else self._due_ns
+            if self._answers and self._answers[0][0] < min(before_ns, due_ns + 1):
+                self._take_answer(*self._answers.popleft())
+            elif due_ns < before_ns:
+                if self._opening is not None:
+                    self._look(due_ns, out)
+                else:
+                    self._look_for_findings(due_ns, out)
+            else:
+                return
+
+    def _look_for_findings(self, at_ns: int, out: Out) -> None:
+        """Ask the providers while no diagnosis is open; what they find may open one."""
+        self._due_ns = None
+        self._ask(at_ns, out)
+        if not self._open(at_ns, out):
+            self._due_ns = self._next_asked_ns(at_ns)
+
+    def _ask(self, at_ns: int, out: Out) -> None:
+        """Ask the providers, if there may be something new, and take the symptoms they find."""
+        counting = self._presences.counting(at_ns, self._waits_ns)
+        if self._asked.is_due(at_ns, counting):
+            for symptom in self._asked.ask(at_ns, self._situation(counting), counting):
+                out.append(symptom)
+                self._take_symptom(symptom, at_ns)
+
+    def _next_asked_ns(self, at_ns: int) -> int | None:
+        """Return when the providers may find something else although no symptom changes."""
+        if not self._asked.is_used:
+            return None
+        turn_ns = self._presences.next_ns(at_ns, self._waits_ns)
+        return _half_from_any([turn_ns, self._asked.next_ns(at_ns)])
+
+    def _take_answer(self, at_ns: int, given: RecordedAnswer) -> None:
+        """Count an answer to a test of the open diagnosis; others mean nothing any more."""
+        opening = self._opening
+        if opening is None or given.diagnosis != opening.id:
+            return
+        if is_answer(self.knowledge, given.test, given.answer):
+            opening.answers[given.test] = given.answer
+            opening.has_new_answers = True
+            half_ns = _half_from(at_ns)
+            self._due_ns = half_ns if self._due_ns is None else min(half_ns, self._due_ns)
 
     def _look(self, at_ns: int, out: Out) -> None:
         """Evaluate the evidence at an instant: revise the open diagnosis, or close it."""
@@ -348,15 +469,20 @@ class FaultTracker:
                 self._presences[name].forget(at_ns)
         onsets_ns = self._presences.onsets(at_ns)
         if onsets_ns:
-            opening.quiet_since_ns = None
             self._waits_ns = self._waits.until_ns(onsets_ns)
+        if self._asked.is_used:
+            self._ask(at_ns, out)
+            onsets_ns = self._presences.onsets(at_ns)
+        if onsets_ns:
+            opening.quiet_since_ns = None
             self._revise(opening, at_ns, out)
         elif opening.quiet_since_ns is None:
             opening.quiet_since_ns = at_ns
             self._waits_ns = {}
         if opening.is_over(at_ns):
             out += opening.healed(at_ns)
-            self._opening = self._due_ns = None
+            self._opening = None
+            self._due_ns = self._next_asked_ns(at_ns)
         else:
             self._due_ns = self._next_ns(opening, at_ns)
 
@@ -372,25 +498,40 @@ class FaultTracker:
         present = [name for name, counts in counting.items() if counts == "present"]
         fading = not all(self._presences[name].is_there for name in present)
         news = opening.take_evidence(counting, fading=fading)
-        if not news:
-            return
+        levels = self._presences.levels(present, self._level)
+        if opening.has_new_answers or levels.items() - opening.levels.items():
+            news, opening.has_new_answers = "more", False
+        opening.levels = levels
+        if self._asked.answers != opening.asked_answers:
+            news, opening.asked_answers = "more", self._asked.answers
         heading = DiagnosisId(opening.id, opening.next_revision, at_ns)
-        # Only evidence that is followed counts here: providers asked at an instant do not, as yet.
-        made = answer(self.knowledge, self._situation(counting), heading, EFFORT)
-        last = opening.last if news == "less" else None
-        if last is not None and not self._repairs.may_replace(last, made, present):
-            return
-        if opening.revise(made):
+        made = opening.last
+        if news:
+            made = answer(self.knowledge, self._situation(counting), heading, EFFORT)
+            made = replace(made, asked=self._asked.names)
+            last = opening.last if news == "less" else None
+            if last is not None and not self._repairs.may_replace(last, made, present):
+                made = last
+        if made is not None and self._asked.texts != opening.texts:
+            made = _with_texts(made, opening.texts, self._asked.texts, heading)
+            opening.texts = self._asked.texts
+        if made is not None and made is not opening.last and opening.revise(made):
             out.append(made)
+
+    def _level(self, symptom: Symptom) -> int | None:
+        """Return the level of a symptom's size, of a finding that of its strength; None if none."""
+        if self._presences.is_finding(symptom.id) and 0.0 < symptom.strength < 1.0:
+            return round(2.0 * math.atanh(symptom.strength))  # the log of its likelihood ratio
+        return self.knowledge.level(symptom)
 
     def _next_ns(self, opening: OpenDiagnosis, at_ns: int) -> int | None:
         """Return when something changes next without a new symptom."""
+        asked_ns = self._next_asked_ns(at_ns)
         if opening.quiet_since_ns is not None:
-            return _half_from(opening.quiet_since_ns + FORGOTTEN_NS)
-        times = [self._presences.next_ns(at_ns, self._waits_ns)]
+            return _half_from_any([opening.quiet_since_ns + FORGOTTEN_NS, asked_ns])
+        times = [self._presences.next_ns(at_ns, self._waits_ns), asked_ns]
         times += self._ends_ns(opening, at_ns).values()
-        next_ns = min((time for time in times if time is not None and time > at_ns), default=None)
-        return None if next_ns is None else _half_from(next_ns)
+        return _half_from_any([time for time in times if time is not None and time > at_ns])
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state needed by ``resume``, as JSON, without the rows of ``history_s``."""
@@ -409,6 +550,7 @@ class FaultTracker:
             "opening": None if self._opening is None else self._opening.snapshot(),
             "last_id": self._last_id,
             "due_ns": self._due_ns,
+            "asked": self._asked.snapshot(),
         }
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
@@ -430,6 +572,10 @@ class FaultTracker:
         opening = snapshot["opening"]
         self._opening = None if opening is None else OpenDiagnosis.resumed(opening)
         self._last_id, self._due_ns = snapshot["last_id"], snapshot["due_ns"]
+        if "asked" in snapshot:  # not written by earlier versions
+            self._asked.resume(snapshot["asked"])
+        elif self._asked.is_used:
+            self._due_ns = _half_from_any([self._until_ns + 1, self._due_ns])
 
 
 def _timed(symptoms: Iterable[Symptom], *, records: bool) -> list[Event]:
@@ -438,6 +584,20 @@ def _timed(symptoms: Iterable[Symptom], *, records: bool) -> list[Event]:
 
 def _when(event: Event) -> int:
     return event[0]
+
+
+def _with_texts(
+    made: Diagnosis, before: Iterable[str], now: Iterable[str], heading: DiagnosisId
+) -> Diagnosis:
+    """Return an answer with other findings that indicate no failure mode."""
+    own = [text for text in made.findings if text not in (*before, *now)]
+    return replace(made, findings=(*own, *now), revision=heading.revision, at_ns=heading.at_ns)
+
+
+def _half_from_any(times_ns: Iterable[int | None]) -> int | None:
+    """Return the first multiple of half a second from the earliest of some instants on."""
+    known = [at_ns for at_ns in times_ns if at_ns is not None]
+    return _half_from(min(known)) if known else None
 
 
 def _half_from(at_ns: int) -> int:

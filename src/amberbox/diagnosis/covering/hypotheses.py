@@ -21,11 +21,10 @@ from amberbox.diagnosis.covering.observations import (
     outcomes,
     predict,
 )
-from amberbox.diagnosis.covering.search import (
-    covering_problem,
-    search,
-)
+from amberbox.diagnosis.covering.problem import covering_problem
+from amberbox.diagnosis.covering.search import search
 
+LEAST_FIT = 0.05  # a size that is less probable, against the most probable one, is not explained
 EXPECTED = 0.5  # from this probability on a symptom is expected of a hypothesis
 
 
@@ -39,17 +38,32 @@ def signature(
         outcomes(model, a.check, prediction)[a.check.level(a.outcome)] >= EXPECTED
         for a in evidence.answers
     )
-    return (prediction.unknown, frozenset(caused), frozenset(expected), tuple(answers))
+    graded = model.tables.graded
+    sized = (
+        [
+            (name, round(prediction.sizes(model, place)[level], 6))
+            for name, observation in evidence.observations.items()
+            if (level := observation.level) is not None
+            and (place := model.sign_places.get(name, -1)) in graded
+        ]
+        if graded
+        else []
+    )
+    return (frozenset(caused), frozenset(expected), tuple(answers), *sized)
 
 
 def group_hypotheses(
     hypotheses: Sequence[Hypothesis], signatures: Sequence[object]
 ) -> tuple[tuple[Hypothesis, ...], tuple[AmbiguityGroup, ...]]:
-    """Return the hypotheses with their ambiguity filled in, and the groups by probability."""
+    """Return the hypotheses with their ambiguity filled in, and the groups.
+
+    Hypotheses are ordered, and so are groups by their most probable member: many improbable sets
+    that nothing tells apart do not come before one that is more probable than each.
+    """
     similar: dict[object, list[Hypothesis]] = {}
     for hypothesis, key in zip(hypotheses, signatures, strict=True):
         similar.setdefault(key, []).append(hypothesis)
-    groups = sorted(map(_group, similar.values()), key=lambda group: -group.probability)
+    groups = [_group(alike) for alike in similar.values()]
     members = {name: g.members for g in groups for name in (*g.members, *g.wider)}
     return tuple(_filled(h, members[h.id]) for h in hypotheses), tuple(groups)
 
@@ -66,10 +80,30 @@ def _group(similar: Sequence[Hypothesis]) -> AmbiguityGroup:
     return AmbiguityGroup(members, sum(h.probability for h in similar), others)
 
 
+_UNLISTED_SETS = 10  # sets that are listed for each that is left when unlisted modes are one
 FEWEST = 3  # so many known faults at once may be one cause that is not in the FMEA
 
 Sets = Sequence[tuple[frozenset[str], float]]
 Misses = Mapping[int, float]  # per symptom how probable it does not show
+
+
+def with_unlisted(model: Model, sets: Sets) -> tuple[Sets, Mapping[frozenset[str], frozenset[str]]]:
+    """Return sets in which all modes that are not in the FMEA are the unknown one.
+
+    Equal sets are one, with the sum of their shares. Return also which set each was made of, the
+    most probable of them, where that is another one.
+    """
+    if not model.unlisted:
+        return sets, {}
+    shares: dict[frozenset[str], float] = {}
+    meant: dict[frozenset[str], frozenset[str]] = {}
+    for faults, share in sets:
+        own = faults
+        if faults & model.unlisted:
+            own = faults - model.unlisted | {UNKNOWN}
+        meant.setdefault(own, faults)
+        shares[own] = shares.get(own, 0.0) + share
+    return sorted(shares.items(), key=lambda found: -found[1]), meant
 
 
 def with_common_cause(model: Model, evidence: Evidence, sets: Sets) -> tuple[Sets, float]:
@@ -109,7 +143,11 @@ def _factor(
 
 def _together(model: Model, evidence: Evidence, sets: Sets, within_s: float) -> Sets:
     """Return the sets of enough known modes that began within ``within_s`` of each other."""
-    many = [(faults, share) for faults, share in sets if len(faults - {UNKNOWN}) >= FEWEST]
+    many = [
+        (faults, share)
+        for faults, share in sets
+        if len(faults - {UNKNOWN} - following(model, faults)) >= FEWEST
+    ]
     named = sorted(frozenset().union(*(faults for faults, _ in many)) - {UNKNOWN})
     misses = {fault: predict(model, [fault]).misses for fault in named}
     onsets = {
@@ -123,6 +161,13 @@ def _together(model: Model, evidence: Evidence, sets: Sets, within_s: float) -> 
         for faults, share in many
         if _spread_ns([misses[fault] for fault in sorted(faults - {UNKNOWN})], onsets) <= limit_ns
     ]
+
+
+def following(model: Model, faults: Collection[str]) -> frozenset[str]:
+    """Return the faults that may have followed from others of a set."""
+    return frozenset(
+        one.effect for one in model.leads_to if one.cause in faults and one.effect in faults
+    )
 
 
 def _spread_ns(modes: Sequence[Misses], onsets: Mapping[int, int]) -> int:
@@ -177,20 +222,25 @@ def diagnose(
     found so far, and there may be better ones that were not reached. Raises UsageError for a
     conflict or an answer with a name that the model does not have.
     """
-    problem = covering_problem(model.tables, fold_evidence(model, evidence))
-    found = search(problem, max_hypotheses, mass, budget or Budget())
+    problem = covering_problem(model, fold_evidence(model, evidence))
+    most = max_hypotheses * (_UNLISTED_SETS if model.unlisted else 1)
+    found = search(problem, most, mass, budget or Budget())
     ids = model.mode_ids
     listed = [(frozenset(ids[mode] for mode in modes), share) for modes, share in found.sets]
-    sets, grown = with_common_cause(model, evidence, listed)
+    with_common, grown = with_common_cause(model, evidence, listed)
+    sets, meant = with_unlisted(model, with_common)
     sets = sets[:max_hypotheses]
-    predictions = [predict(model, faults) for faults, _ in sets]
+    predictions = [predict(model, meant.get(faults, faults)) for faults, _ in sets]
     known = KnownSymptoms.of(model, evidence)
     hypotheses = [
         known.hypothesis(model, faults, share, prediction)
         for (faults, share), prediction in zip(sets, predictions, strict=True)
     ]
     seen = known.absent.union(place for _, place in known.present)
-    signatures = [signature(model, evidence, seen, prediction) for prediction in predictions]
+    signatures = [
+        (UNKNOWN in faults, *signature(model, evidence, seen, prediction))
+        for (faults, _), prediction in zip(sets, predictions, strict=True)
+    ]
     filled, groups = group_hypotheses(hypotheses, signatures)
     findings = tuple(name for name in evidence.observations if name not in model.sign_places)
     covered = found.covered and grown / (grown - 1.0 + 1.0 / found.covered)
@@ -203,26 +253,33 @@ class KnownSymptoms:
 
     present: tuple[tuple[str, int], ...]
     absent: frozenset[int]
+    levels: Mapping[int, int]
 
     @classmethod
     def of(cls, model: Model, evidence: Evidence) -> KnownSymptoms:
         """Select the symptoms that are in the model."""
         places = model.sign_places
-        present, absent = [], []
+        present, absent, levels = [], [], {}
         for name, observation in evidence.observations.items():
             place = places.get(name)
             if place is not None and observation.state == "present":
                 present.append((name, place))
+                if observation.level is not None and place in model.tables.graded:
+                    levels[place] = observation.level
             elif place is not None and observation.state == "absent":
                 absent.append(place)
-        return cls(tuple(present), frozenset(absent))
+        return cls(tuple(present), frozenset(absent), levels)
 
     def hypothesis(
         self, model: Model, faults: frozenset[str], probability: float, prediction: Prediction
     ) -> Hypothesis:
         """Return the hypothesis of a set of faults: explained, unexplained, contrary symptoms."""
         unknown = prediction.unknown and model.unknown is not None and model.unknown.detects > 0
-        explained = {place for _, place in self.present if unknown or place in prediction.misses}
+        explained = {
+            place
+            for _, place in self.present
+            if unknown or (place in prediction.misses and self._fits(model, place, prediction))
+        }
         against = (place for place in prediction.misses if place in self.absent)
         return Hypothesis(
             hypothesis_id(faults),
@@ -236,7 +293,16 @@ class KnownSymptoms:
                 if prediction.expected(model, place) >= EXPECTED
             ),
             criticality=sum(model.modes[place].criticality for place in sorted(prediction.modes)),
+            follows=following(model, faults),
         )
+
+    def _fits(self, model: Model, place: int, prediction: Prediction) -> bool:
+        """Return whether the size of a symptom is one that the faults show."""
+        level = self.levels.get(place)
+        if level is None:
+            return True
+        sizes = prediction.sizes(model, place)
+        return sizes[level] >= LEAST_FIT * max(sizes[1:])
 
 
 def hypothesis_id(faults: Iterable[str]) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,12 +166,104 @@ class LinkArrays:
         return sums
 
 
+Cumulated = tuple[float, ...]
+"""The probability of a size up to each bin, when a cause shows a symptom; 0 for bin 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class GradedCauses:
+    """The causes of a symptom with sizes: (place, detects, cumulated sizes)."""
+
+    bins: int
+    modes: tuple[tuple[int, float, Cumulated], ...]
+    functions: tuple[tuple[int, float, Cumulated], ...]
+
+
+TimedLinks = tuple[tuple[float, tuple[float, float] | None], ...]
+"""The links of a mode to a symptom, one or more: (1 - detects, after_s)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConsequencePlaces:
+    """A consequence, with the places of both modes."""
+
+    cause: int
+    effect: int
+    p: float
+    after_s: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class ExclusiveCluster:
+    """Modes that are connected by excluding each other.
+
+    ``distinct`` are those that a search must tell apart: all, unless each excludes all others;
+    then those that lead to others or follow from them.
+    """
+
+    modes: tuple[int, ...]
+    distinct: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class JointModes:
+    """Modes, by place, that exclude each other or lead to each other.
+
+    ``excludes`` are the modes that each excludes, ``exclusive`` the same with itself, ``cluster``
+    is the one that it belongs to. ``causes`` are the modes that lead to each, ``effects`` those to
+    which each leads. ``priors`` are those of all modes.
+    """
+
+    excludes: Mapping[int, frozenset[int]]
+    exclusive: Mapping[int, frozenset[int]]
+    cluster: Mapping[int, ExclusiveCluster]
+    causes: Mapping[int, tuple[ConsequencePlaces, ...]]
+    effects: Mapping[int, tuple[ConsequencePlaces, ...]]
+    priors: tuple[float, ...]
+
+    @classmethod
+    def of(cls, model: Model) -> JointModes:
+        """Resolve the names of a model."""
+        excludes: dict[int, set[int]] = {}
+        for place, mode in enumerate(model.modes):
+            for name in mode.excludes:
+                other = model.mode_place(name)
+                if other != place:
+                    excludes.setdefault(place, set()).add(other)
+                    excludes.setdefault(other, set()).add(place)
+        effects, causes = _consequences(model)
+        priors = tuple(min(mode.prior, LARGEST_PRIOR) for mode in model.modes)
+        closed = {place: frozenset(others) for place, others in excludes.items()}
+        exclusive = {place: others | {place} for place, others in closed.items()}
+        clusters = {m: one for one in _clusters(closed, {*causes, *effects}) for m in one.modes}
+        return cls(closed, exclusive, clusters, causes, effects, priors)
+
+    def clusters_of(self, modes: Iterable[int]) -> tuple[ExclusiveCluster, ...]:
+        """Return the clusters of modes that exclude each other to which some of these belong."""
+        if not self.cluster:
+            return ()
+        near = {one.modes: one for mode in modes if (one := self.cluster.get(mode))}
+        return tuple(near.values())
+
+    def origins(self, modes: Iterable[int]) -> set[int]:
+        """Return all modes that lead to some of these, directly or not."""
+        return _reached(modes, lambda mode: (one.cause for one in self.causes.get(mode, ())))
+
+    def results(self, modes: Iterable[int]) -> set[int]:
+        """Return all modes that follow from some of these, directly or not."""
+        return _reached(modes, lambda mode: (one.effect for one in self.effects.get(mode, ())))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelTables:
     """The arrays of a model for the search, by place; ``unknown`` is the unknown mode's, or -1.
 
     ``component`` is the place of the component that a mode takes down, -1 for none.
-    ``pairs`` are (component, function) where the one alone loses the other.
+    ``pairs`` are (component, function) where the one alone loses the other. ``graded`` are the
+    causes of each symptom of which some cause gives a size, ``timed`` those of each symptom of
+    which some cause gives a time. ``joint`` is about modes that are not independent.
+
+    ``log_odds`` of a mode that others lead to is the most that these can make of it.
     """
 
     log_odds: Floats
@@ -182,6 +276,9 @@ class ModelTables:
     pair_component: Ints
     pair_function: Ints
     unknown: int
+    graded: Mapping[int, GradedCauses]
+    timed: Mapping[int, Mapping[int, TimedLinks]]
+    joint: JointModes
 
     @classmethod
     def of(cls, model: Model) -> ModelTables:
@@ -203,6 +300,9 @@ class ModelTables:
             np.array([pair[0] for pair in pairs], np.int64),
             np.array([pair[1] for pair in pairs], np.int64),
             -1 if model.unknown is None else len(model.modes),
+            _graded(model),
+            _timed(model),
+            JointModes.of(model),
         )
 
 
@@ -218,7 +318,18 @@ def _log_odds(model: Model) -> Floats:
     chance = np.minimum(np.array(priors, np.float64), LARGEST_PRIOR)
     with np.errstate(divide="ignore"):
         odds: Floats = np.log(chance) - np.log1p(-chance)
+    for place, causes in _consequences(model)[1].items():
+        odds[place] = log_odds_with(float(chance[place]), [one.p for one in causes])
     return odds
+
+
+def log_odds_with(prior: float, chances: Sequence[float]) -> float:
+    """Return the logarithm of the weight of a mode to which others lead, against its absence.
+
+    Its absence counts ``1 - prior``, without what it says about the others.
+    """
+    absent = (1.0 - prior) * math.prod(1.0 - p for p in chances)
+    return math.log(1.0 - absent) - math.log1p(-prior) if absent < 1 else -math.inf
 
 
 def _links(model: Model, causes: dict[str, int]) -> LinkArrays:
@@ -228,6 +339,81 @@ def _links(model: Model, causes: dict[str, int]) -> LinkArrays:
         if link.cause in causes
     ]
     return LinkArrays.of(triples, len(causes), len(model.signs))
+
+
+def _reached(modes: Iterable[int], near: Callable[[int], Iterable[int]]) -> set[int]:
+    found: set[int] = set()
+    waiting = list(modes)
+    while waiting:
+        more = set(near(waiting.pop())) - found
+        found |= more
+        waiting += more
+    return found
+
+
+def _clusters(
+    excludes: Mapping[int, frozenset[int]], following: Collection[int]
+) -> Iterator[ExclusiveCluster]:
+    left = dict(excludes)
+    while left:
+        waiting = [next(iter(left))]
+        found: set[int] = set()
+        while waiting:
+            mode = waiting.pop()
+            if mode not in found:
+                found.add(mode)
+                waiting += left.pop(mode)
+        is_complete = all(len(excludes[mode]) == len(found) - 1 for mode in found)
+        distinct = found.intersection(following) if is_complete else found
+        yield ExclusiveCluster(tuple(sorted(found)), frozenset(distinct))
+
+
+Consequences = dict[int, tuple[ConsequencePlaces, ...]]
+
+
+def _consequences(model: Model) -> tuple[Consequences, Consequences]:
+    """Return the consequences by their cause, and by their effect."""
+    by_cause: Consequences = {}
+    by_effect: Consequences = {}
+    for one in model.leads_to:
+        cause, effect = model.mode_place(one.cause), model.mode_place(one.effect)
+        resolved = ConsequencePlaces(cause, effect, one.p, one.after_s)
+        by_cause[cause] = (*by_cause.get(cause, ()), resolved)
+        by_effect[effect] = (*by_effect.get(effect, ()), resolved)
+    return by_cause, by_effect
+
+
+def _graded(model: Model) -> dict[int, GradedCauses]:
+    graded: dict[int, tuple[list[Any], list[Any]]] = {
+        model.sign_places[link.symptom]: ([], []) for link in model.links if link.sizes
+    }
+    for link in model.links:
+        place = model.sign_places[link.symptom]
+        if place not in graded or not link.detects:
+            continue
+        bins = model.signs[place].bins
+        sizes = link.sizes or (1 / bins,) * bins
+        sums = (total if total < 1 - 1e-12 else 1.0 for total in accumulate(sizes[:-1]))
+        cumulated = (0.0, *sums, 1.0)
+        is_loss = link.cause in model.function_places
+        causes = model.function_places if is_loss else model.mode_places
+        graded[place][is_loss].append((causes[link.cause], link.detects, cumulated))
+    return {
+        place: GradedCauses(model.signs[place].bins, tuple(modes), tuple(functions))
+        for place, (modes, functions) in graded.items()
+    }
+
+
+def _timed(model: Model) -> dict[int, dict[int, TimedLinks]]:
+    timed: dict[int, dict[int, TimedLinks]] = {
+        model.sign_places[link.symptom]: {} for link in model.links if link.after_s is not None
+    }
+    for link in model.links:
+        of = timed.get(model.sign_places[link.symptom])
+        if of is not None and link.cause in model.mode_places and link.detects:
+            place = model.mode_places[link.cause]
+            of[place] = (*of.get(place, ()), (1.0 - link.detects, link.after_s))
+    return timed
 
 
 def _modes_of(component: Iterable[int], count: int) -> tuple[tuple[int, ...], ...]:
@@ -246,12 +432,17 @@ class Mode:
     """A failure mode ``component#mode`` with its prior probability.
 
     ``takes_down``: while it is present, its component does not serve those that need it.
+    ``excludes`` are modes that are never present together with it; one side is enough.
+    ``is_unlisted``: it stands for the faults of its component that are not in the FMEA; answers
+    count it as the unknown mode.
     """
 
     id: str
     prior: float
     takes_down: bool = False
     criticality: float = 0.0
+    excludes: frozenset[str] = frozenset()
+    is_unlisted: bool = False
 
     @property
     def component(self) -> str:
@@ -264,11 +455,13 @@ class Sign:
     """A symptom that can be seen: ``leak`` is how probable it shows without any cause.
 
     ``read_cost_s`` is what reading it on demand costs, None when it cannot be read on demand.
+    ``bins``: a present symptom has one of so many sizes, from 1 (small) on; 0 if it has none.
     """
 
     id: str
     leak: float = 0.0
     read_cost_s: float | None = 0.0
+    bins: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,12 +481,26 @@ class Link:
     """A cause shows a symptom with probability ``detects``.
 
     ``cause`` is a failure mode, or a function: then its loss is the cause. Two links from one
-    cause to one symptom are two independent ways to show it.
+    cause to one symptom are two independent ways to show it. ``sizes`` are the probabilities of the
+    symptom's bins when the cause shows it, empty if all are equally probable. ``after_s``: it
+    begins so long after a failure mode does (from, to); None if no matter when.
     """
 
     cause: str
     symptom: str
     detects: float
+    sizes: tuple[float, ...] = ()
+    after_s: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Consequence:
+    """A failure mode makes another one follow with probability ``p``, ``after_s`` later."""
+
+    cause: str
+    effect: str
+    p: float
+    after_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,8 +528,9 @@ class Unknown:
 class Model:
     """Failure modes, symptoms, functions and the links between them; checked, never changed.
 
-    Raises UsageError for probabilities outside 0..1, names given twice or not at all, and needs
-    that go in a circle. A prior of 1 counts as 1 - 1e-12.
+    Raises UsageError for probabilities outside 0..1, names given twice or not at all, sizes that
+    are no distribution over a symptom's bins, and needs or consequences that go in a circle. A
+    prior of 1 counts as 1 - 1e-12.
     """
 
     modes: tuple[Mode, ...]
@@ -330,9 +538,11 @@ class Model:
     links: tuple[Link, ...]
     functions: tuple[Function, ...] = ()
     unknown: Unknown | None = Unknown()
+    leads_to: tuple[Consequence, ...] = ()
 
     def __post_init__(self) -> None:
         self._check_names()
+        self._check_grades()
         for circle in cycles({function.id: function.needs for function in self.functions}):
             raise UsageError(f"needs go in a circle: {' -> '.join((*circle, circle[0]))}")
         for mode in self.modes:
@@ -360,6 +570,11 @@ class Model:
     def mode_places(self) -> dict[str, int]:
         """Return the place of each mode, the unknown one included."""
         return {name: place for place, name in enumerate(self.mode_ids)}
+
+    @cached_property
+    def unlisted(self) -> frozenset[str]:
+        """Return the modes that stand for faults that are not in the FMEA, but UNKNOWN itself."""
+        return frozenset(mode.id for mode in self.modes if mode.is_unlisted)
 
     @cached_property
     def sign_places(self) -> dict[str, int]:
@@ -390,6 +605,30 @@ class Model:
             if link.symptom not in self.sign_places:
                 near = did_you_mean(link.symptom, self.sign_places)
                 raise UsageError(f"there is no symptom '{link.symptom}' of {link.cause}{near}")
+
+    def _check_grades(self) -> None:
+        for link in self.links:
+            bins = self.signs[self.sign_places[link.symptom]].bins
+            if link.sizes and (
+                len(link.sizes) != bins or min(link.sizes) < 0 or abs(sum(link.sizes) - 1) > 1e-6
+            ):
+                what = f"the sizes of {link.symptom} by {link.cause} are no distribution"
+                raise UsageError(f"{what} over its {bins} bins")
+            if link.after_s is not None and link.cause in self.function_places:
+                raise UsageError(f"the loss of {link.cause} has no time: leave out its after_s")
+        for mode in self.modes:
+            for name in mode.excludes:
+                self.mode_place(name)
+        for one in self.leads_to:
+            _probability(one.p, f"chance that {one.cause} leads to {one.effect}")
+            for name in (one.cause, one.effect):
+                self.mode_place(name)
+        follows: dict[str, list[str]] = {one.cause: [] for one in self.leads_to}
+        for one in self.leads_to:
+            follows[one.cause].append(one.effect)
+        needs = {cause: Needs(len(names), tuple(names)) for cause, names in follows.items()}
+        for circle in cycles(needs):
+            raise UsageError(f"consequences go in a circle: {' -> '.join((*circle, circle[0]))}")
 
 
 def _unique(names: Iterable[str], kind: str, taken: set[str] | None = None) -> None:

@@ -156,6 +156,8 @@ def _proposal(
         check.risk,
         gain,
         dict(zip(check.outcomes, chances, strict=True)),
+        check.run,
+        check.moves,
     )
     price_s = by.price_s(check)
     return TestProposal(test, check, gain / price_s if price_s > 0 else math.inf)

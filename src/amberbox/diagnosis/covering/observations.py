@@ -6,15 +6,22 @@ symptoms and outcomes of tests.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
 from amberbox.core.errors import UsageError, did_you_mean
-from amberbox.core.types import Symptom, SymptomState
-from amberbox.diagnosis.covering.model import UNKNOWN, Floats, Model, bits, log_miss
+from amberbox.core.types import Symptom, SymptomState, TestKind
+from amberbox.diagnosis.covering.model import (
+    UNKNOWN,
+    Cumulated,
+    Floats,
+    Model,
+    bits,
+    log_miss,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +35,7 @@ class CheckDetection:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A test: a symptom to read, a question, or a check by a person.
+    """A test: a symptom to read, a question, a check by a person, an experiment or a unit test.
 
     The first outcome is that of a healthy robot, later ones are more severe; each present cause
     reaches its outcome with probability ``detects``, and the most severe outcome that is reached is
@@ -37,10 +44,12 @@ class Check:
     - detects)`` and specificity ``sure``.
 
     A check that ``reads`` a symptom has the outcomes absent and present, and no detections.
+    ``run`` is the name of the experiment or unit test that gives the outcome; the robot ``moves``
+    in it or not.
     """
 
     id: str
-    kind: Literal["read", "question", "check"]
+    kind: TestKind
     text: str
     role: str = ""
     cost_s: float = 0.0
@@ -49,6 +58,8 @@ class Check:
     sure: float = 0.99
     detections: tuple[CheckDetection, ...] = ()
     reads: str = ""
+    run: str = ""
+    moves: bool = False
 
     def __post_init__(self) -> None:
         if len(self.outcomes) < 2:
@@ -89,12 +100,15 @@ def reading_check(symptom: str, cost_s: float) -> Check:
 class Observation:
     """The state of a symptom and the trust in it.
 
-    With probability ``strength`` the observation is right, else it is random with probability 1/2:
-    its likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
+    With probability ``strength`` the observation is right, else it is random: its likelihood is
+    ``strength * P(state | faults) + (1 - strength) / 2``. ``level`` is the bin of a present
+    symptom's size, from 1 on, None if that is not known: then it only counts that it is present.
+    With K bins the random share of a size, and of their absence, is ``1 / (K + 1)``.
     """
 
     state: SymptomState
     strength: float = 1.0
+    level: int | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.strength <= 1.0:
@@ -113,7 +127,8 @@ class AnsweredCheck:
 class Evidence:
     """The evidence: observations, conflicts and answered tests.
 
-    A conflict is a set of failure modes of which at least one is present. ``asked`` are tests that
+    A conflict is a set of failure modes of which at least one is present; a suspicion is one that
+    is right with a probability, as an observation is with its strength. ``asked`` are tests that
     were done or cannot be done: they are not proposed again. ``doubled`` are symptoms that do not
     count, because the data they were measured from have been counted. ``onsets_ns`` are when
     present symptoms began, as far as that is known.
@@ -125,6 +140,7 @@ class Evidence:
     asked: frozenset[str] = frozenset()
     doubled: tuple[str, ...] = ()
     onsets_ns: Mapping[str, int] = field(default_factory=dict)
+    suspicions: tuple[tuple[frozenset[str], float], ...] = ()
 
     def with_observation(self, symptom: str, state: SymptomState) -> Evidence:
         """Return the evidence with the state of a symptom; unknown if it cannot be determined."""
@@ -132,10 +148,16 @@ class Evidence:
         return replace(self, observations=observations | {symptom: Observation(state)})
 
 
+def _no_level(symptom: Symptom) -> int | None:
+    return None
+
+
 def collect_evidence(
-    symptoms: Iterable[Symptom], conflicts: Iterable[Iterable[str]] = ()
+    symptoms: Iterable[Symptom],
+    conflicts: Iterable[Iterable[str]] = (),
+    level_of: Callable[[Symptom], int | None] = _no_level,
 ) -> Evidence:
-    """Collect symptoms so that one measurement counts once.
+    """Collect symptoms so that one measurement counts once; ``level_of`` is the bin of a size.
 
     Of two observations of one symptom the stronger counts; of equally strong ones the one of state
     present. The same holds for symptoms of different sources: one does not count when all it was
@@ -158,7 +180,8 @@ def collect_evidence(
         ):
             doubled.append(symptom.id)
             continue
-        counted[symptom.id] = Observation(symptom.state, min(1.0, symptom.strength))
+        level = level_of(symptom) if symptom.state == "present" else None
+        counted[symptom.id] = Observation(symptom.state, min(1.0, symptom.strength), level)
         onset_ns = symptom.confirmed_ns if symptom.onset_ns is None else symptom.onset_ns
         if symptom.state == "present" and onset_ns is not None:
             onsets_ns[symptom.id] = onset_ns
@@ -178,12 +201,16 @@ Causes = Sequence[tuple[int, float]]
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodFactor:
-    """The likelihood ``alpha + beta * q`` over causes (place, detects)."""
+    """The likelihood ``alpha + beta * q`` over causes (place, detects).
+
+    With ``gain`` it is ``alpha + beta * q + gain * u``, where ``u`` is the q of the next factor.
+    """
 
     alpha: float
     beta: float
     modes: Causes
     functions: Causes = ()
+    gain: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,23 +219,38 @@ class FoldedEvidence:
 
     ``log_weight`` is per mode the logarithm of its prior odds times the probability that all
     certainly absent symptoms are absent; ``log_loss`` that probability per lost function.
+    ``timed`` are present symptoms of which some cause has a time, with onset and strength.
+    ``is_graded``: the size of some symptom counts.
     """
 
     factors: tuple[LikelihoodFactor, ...]
     log_weight: Floats
     log_loss: Floats
+    timed: tuple[TimedSymptom, ...] = ()
+    is_graded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TimedSymptom:
+    """A present symptom (by place) with a known onset, ns."""
+
+    sign: int
+    onset_ns: int
+    strength: float
 
 
 def fold_evidence(model: Model, evidence: Evidence) -> FoldedEvidence:
     """Turn evidence into weights and factors; symptoms that the model lacks are left out."""
     tables = model.tables
-    places, gone, factors = model.sign_places, [], []
+    places, gone, factors, sized = model.sign_places, [], [], []
     for name, observation in evidence.observations.items():
         place = places.get(name)
         if place is None or observation.state == "unknown":
             continue
         if observation.state == "absent" and observation.strength == 1.0:
             gone.append(place)
+        elif observation.level is not None and place in tables.graded:
+            sized.append((place, observation))
         else:
             factors.append(_symptom_factor(model, place, observation))
     absent = np.zeros(len(model.signs), np.bool_)
@@ -218,13 +260,33 @@ def fold_evidence(model: Model, evidence: Evidence) -> FoldedEvidence:
     if model.unknown is not None:
         log_weight[-1] += int(absent.sum()) and absent.sum() * log_miss(model.unknown.denies)
     factors += [_conflict(model, names) for names in evidence.conflicts]
+    factors += [_conflict(model, *suspicion) for suspicion in evidence.suspicions]
     for answered in evidence.answers:
         factors += _answer(model, answered, log_weight, log_loss)
-    return FoldedEvidence(tuple(factors), log_weight, log_loss)
+    for place, observation in sized:
+        factors += _size_factors(model, place, observation, log_weight, log_loss)
+    timed = _timed_symptoms(model, evidence)
+    return FoldedEvidence(tuple(factors), log_weight, log_loss, timed, bool(sized))
+
+
+def _timed_symptoms(model: Model, evidence: Evidence) -> tuple[TimedSymptom, ...]:
+    if not model.tables.timed:
+        return ()
+    onsets_ns, places = evidence.onsets_ns, model.sign_places
+    return tuple(
+        TimedSymptom(places[name], onsets_ns[name], observation.strength)
+        for name, observation in evidence.observations.items()
+        if name in onsets_ns
+        and observation.state == "present"
+        and places.get(name) in model.tables.timed
+    )
 
 
 def _symptom_factor(model: Model, place: int, observation: Observation) -> LikelihoodFactor:
     trust, silent = observation.strength, 1.0 - model.signs[place].leak
+    random = 0.5
+    if place in model.tables.graded and observation.state == "absent":
+        random = 1 / (1 + model.signs[place].bins)
     modes = list(model.tables.modes.by_sign[place])
     functions = model.tables.functions.by_sign[place]
     present = observation.state == "present"
@@ -233,11 +295,69 @@ def _symptom_factor(model: Model, place: int, observation: Observation) -> Likel
         modes += [(model.mode_places[UNKNOWN], shows)] if shows else []
     if present:
         return LikelihoodFactor((1 + trust) / 2, -trust * silent, modes, functions)
-    return LikelihoodFactor((1 - trust) / 2, trust * silent, modes, functions)
+    return LikelihoodFactor((1 - trust) * random, trust * silent, modes, functions)
 
 
-def _conflict(model: Model, names: frozenset[str]) -> LikelihoodFactor:
-    return LikelihoodFactor(1.0, -1.0, [(model.mode_place(name), 1.0) for name in sorted(names)])
+def _size_factors(
+    model: Model, place: int, observation: Observation, log_weight: Floats, log_loss: Floats
+) -> Iterator[LikelihoodFactor]:
+    """Yield the factor of a symptom's size, by noisy-MAX.
+
+    ``P(level <= k) = L(k) * prod F(k)`` over the present causes; that of exactly ``k`` is its
+    difference to ``k - 1``. Of a certain size, ``prod F(k)`` is folded into the weights.
+    """
+    trust, level = observation.strength, observation.level or 0
+    bins = model.signs[place].bins
+    modes, functions = _up_to_level(model, place, level)
+    up_to, below = (leak_up_to(model, place, at) for at in (level, level - 1))
+    if trust < 1:
+        yield LikelihoodFactor(
+            (1 - trust) / (bins + 1), -trust * below, _causes(modes, 1), _causes(functions, 1),
+            trust * up_to,
+        )  # fmt: skip
+        yield LikelihoodFactor(1.0, 0.0, _causes(modes, 0), _causes(functions, 0))
+        return
+    for weights, causes in ((log_weight, modes), (log_loss, functions)):
+        for cause, most, _ in causes:
+            weights[cause] += math.log(most) if most > 0 else -math.inf
+    yield LikelihoodFactor(1.0, -below / up_to, _ratios(modes), _ratios(functions))
+
+
+UpToLevel = list[tuple[int, float, float]]
+"""Causes with the probability that each shows a symptom up to a level, and up to the one below."""
+
+
+def _up_to_level(model: Model, place: int, level: int) -> tuple[UpToLevel, UpToLevel]:
+    graded = model.tables.graded[place]
+
+    def of(cause: int, detects: float, sizes: Cumulated) -> tuple[int, float, float]:
+        up_to, below = (1 - detects * (1 - sizes[at]) for at in (level, level - 1))
+        return cause, up_to, below
+
+    modes = [of(*cause) for cause in graded.modes]
+    if model.unknown is not None and model.unknown.detects:
+        sizes = tuple(at / graded.bins for at in range(graded.bins + 1))
+        modes.append(of(model.mode_places[UNKNOWN], model.unknown.detects, sizes))
+    return modes, [of(*cause) for cause in graded.functions]
+
+
+def leak_up_to(model: Model, place: int, level: int) -> float:
+    """Return the probability that a symptom without a cause shows up to a level, 0 for absent."""
+    sign = model.signs[place]
+    return 1.0 - sign.leak * (1.0 - level / sign.bins)
+
+
+def _causes(of: UpToLevel, below: int) -> Causes:
+    return [(cause, 1.0 - probabilities[below]) for cause, *probabilities in of]
+
+
+def _ratios(of: UpToLevel) -> Causes:
+    return [(cause, 1.0 - below / most) for cause, most, below in of if most > 0]
+
+
+def _conflict(model: Model, names: frozenset[str], trust: float = 1.0) -> LikelihoodFactor:
+    modes = [(model.mode_place(name), 1.0) for name in sorted(names)]
+    return LikelihoodFactor((1.0 + trust) / 2, -trust, modes)
 
 
 def _answer(
@@ -300,6 +420,21 @@ class Prediction:
         """Return the weight of a symptom's absence against the faults, 0 to 1."""
         unknown = model.unknown.denies if self.unknown and model.unknown else 0.0
         return self._shows(model, sign, unknown)
+
+    def sizes(self, model: Model, sign: int) -> list[float]:
+        """Return the probability of each level of a graded symptom, from absent (0) on."""
+        graded = model.tables.graded[sign]
+        present = [cause for cause in graded.modes if cause[0] in self.modes]
+        present += [cause for cause in graded.functions if cause[0] in self.lost]
+        up_to = []
+        for level in range(graded.bins + 1):
+            chance = leak_up_to(model, sign, level)
+            for _, detects, cumulated in present:
+                chance *= 1 - detects * (1 - cumulated[level])
+            if self.unknown and model.unknown is not None:
+                chance *= 1 - model.unknown.detects * (1 - level / graded.bins)
+            up_to.append(chance)
+        return [most - less for most, less in zip(up_to, [0.0, *up_to[:-1]], strict=True)]
 
     def _shows(self, model: Model, sign: int, unknown: float) -> float:
         silent = (1.0 - model.signs[sign].leak) * self.misses.get(sign, 1.0)

@@ -21,6 +21,7 @@ from amberbox.core.conditions import (
 )
 from amberbox.core.contracts import EvidenceFollower
 from amberbox.core.expression import Expression, ExpressionError, reason
+from amberbox.core.expressions.evaluation import WindowCache
 from amberbox.core.expressions.tree import (
     AddressNode,
     AgeNode,
@@ -36,6 +37,7 @@ from amberbox.core.samples import Samples
 from amberbox.core.types import Batch, IntArray, Status, Symptom, SymptomState
 from amberbox.diagnosis.fmea.model import Fmea
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.symptom_sizes import QUARTER_NS, SymptomSizes
 
 
 def follow(knowledge: Knowledge) -> EvidenceFollower:
@@ -107,7 +109,9 @@ class AddressColumns:
         for each in batch_and_children(batch):
             for column in self._by_item.get(each.item, ()):
                 name, index = column.variable, column.index
-                if index is None or "parent_seq" not in each.columns:
+                if not name:  # of an item alone only the age matters
+                    column.extend(each.log_time_ns, np.ones(len(each.log_time_ns)))
+                elif index is None or "parent_seq" not in each.columns:
                     column.extend(each.log_time_ns, batch_column(each, name, index))
                 else:
                     values = child_row_column(batch, each, name, index)
@@ -160,8 +164,6 @@ def _pairs(samples: Samples) -> list[list[Any]]:
     return [[at, as_json(v)] for at, v in zip(samples.times_ns.tolist(), plain, strict=True)]
 
 
-QUARTER_NS = NS // 4
-"""Conditions are looked at at multiples of this."""
 FRESH_NS = 5 * NS
 """What is older is not known."""
 _MARGIN_NS = NS
@@ -185,11 +187,17 @@ class ConditionTracker:
 
     def __init__(self, fmea: Fmea) -> None:
         named = {s.id: s.condition for s in fmea.symptoms.values() if s.condition is not None}
-        history_ns = max((one.history_ns for one in named.values()), default=0)
-        addresses = dict.fromkeys(name for one in named.values() for name in one.addresses())
+        self._sizes = SymptomSizes(fmea)
+        measures = {name: of.measure.expression for name, of in self._sizes.scales.items()}
+        read = (*named.values(), *measures.values())
+        history_ns = max((one.history_ns for one in read), default=0)
+        addresses = dict.fromkeys(name for one in read for name in one.addresses())
         self._columns = AddressColumns(addresses, max(history_ns, FRESH_NS) + _MARGIN_NS)
         samples = self._columns.samples()
         self._all = [TrackedCondition(name, one, samples) for name, one in named.items()]
+        self._measures = {
+            name: TrackedCondition(name, one, samples) for name, one in measures.items()
+        }
         self._forgot_ns = 0
 
     @property
@@ -200,16 +208,18 @@ class ConditionTracker:
     @property
     def history_s(self) -> float:
         """Return how far back rows have to be fed again after ``resume``, seconds."""
-        return self._columns.keep_ns / NS if self._all else 0.0
+        return self._columns.keep_ns / NS if self._all or self._measures else 0.0
 
     @property
     def troubles(self) -> dict[str, str]:
         """Return the conditions whose last evaluation failed, with the reason."""
-        return {one.id: one.trouble for one in self._all if one.trouble}
+        every = (*self._measures.values(), *self._all)
+        return {one.id: one.trouble for one in every if one.trouble}
 
     def begin(self, at_ns: int) -> list[Symptom]:
         """Begin an epoch, in which nothing is known; return the symptoms that become unknown."""
         self._columns.forget()
+        self._sizes.begin()
         self._forgot_ns = at_ns
         return [found for one in self._all for found in one.begin(at_ns)]
 
@@ -222,15 +232,17 @@ class ConditionTracker:
         self._columns.take(status)
 
     def receive(self, found: Sequence[object]) -> None:
-        """Add the statuses: conditions may read levels and outputs."""
-        for status in found:
-            if isinstance(status, Status):
-                self._columns.take(status)
+        """Add the statuses: conditions may read levels and outputs; and the symptoms to measure."""
+        for one in found:
+            if isinstance(one, Status):
+                self._columns.take(one)
+            elif isinstance(one, Symptom):
+                self._sizes.take(one)
 
     def advance(self, after_ns: int, until_ns: int) -> list[Symptom]:
         """Return the symptoms that change in ``(after_ns, until_ns]``, in order of time."""
         found: list[Symptom] = []
-        while self._all and after_ns < until_ns:
+        while (self._all or self._measures) and after_ns < until_ns:
             end_ns = min(until_ns, after_ns + _BLOCK_NS)
             found += self._block(ticks(QUARTER_NS, after_ns, end_ns))
             after_ns = end_ns
@@ -244,13 +256,20 @@ class ConditionTracker:
             return []
         fresh = SampleFreshness(instants)
         found = [symptom for one in self._all for symptom in one.look(instants, fresh)]
+        for symptom in found:
+            self._sizes.take(symptom)
+        found += self._sizes.look(instants, self._measured)
         found.sort(key=lambda symptom: symptom.confirmed_ns or 0)
         return found
+
+    def _measured(self, name: str, instants: IntArray) -> list[float]:
+        return self._measures[name].values(instants)
 
     def snapshot(self, until_ns: int) -> dict[str, Any]:
         """Return the state needed by ``resume``, as JSON, without the rows of ``history_s``."""
         states = {one.id: one.state for one in self._all}
-        return {**self._columns.snapshot(until_ns), "states": states}
+        sizes = self._sizes.snapshot()
+        return {**self._columns.snapshot(until_ns), "states": states, "sizes": sizes}
 
     def resume(self, snapshot: Mapping[str, Any], until_ns: int) -> None:
         """Go on from what ``snapshot`` returned."""
@@ -258,6 +277,8 @@ class ConditionTracker:
         self._columns.resume(snapshot)
         for one in self._all:
             one.resume(snapshot["states"][one.id])
+        if "sizes" in snapshot:  # not written by earlier versions
+            self._sizes.resume(snapshot["sizes"])
 
 
 class TrackedCondition:
@@ -302,6 +323,18 @@ class TrackedCondition:
         for place in changed.tolist():
             yield from self._become(_STATES[states[place]], int(instants[place]))
 
+    def values(self, instants: IntArray) -> list[float]:
+        """Return its values at instants; NaN where they are not known."""
+        known = SampleFreshness(instants)
+        fresh = known.all_of(self._wanted)
+        found = np.full(len(instants), np.nan)
+        try:
+            windows = known.windows(instants.tobytes())
+            found[fresh] = self._expression.numbers(self._samples, instants, windows)[fresh]
+        except _WRONG as error:
+            self.trouble = str(error)
+        return list(map(float, found))
+
     def _stays(self, fresh: Any) -> bool:
         """Return whether it cannot have changed since its last evaluation."""
         if not fresh.any():
@@ -324,7 +357,7 @@ class TrackedCondition:
                 return np.where(np.isnan(numbers), 2, (numbers != 0).astype(np.int64))
         return [self._code(now, known.windows(now)) for now in instants.tolist()]
 
-    def _code(self, now: int, windows: dict[str, Any]) -> int:
+    def _code(self, now: int, windows: WindowCache) -> int:
         """Evaluate at an instant; a value of a wrong type makes it unknown."""
         try:
             value = self._expression.numbers(self._samples, now, windows)
@@ -361,11 +394,11 @@ class SampleFreshness:
         self._instants = instants
         self._always = np.ones(len(instants), bool)
         self._of: dict[str, Any] = {}
-        self._windows: dict[int | bytes, dict[str, Any]] = {}
+        self._windows: dict[int | bytes, WindowCache] = {}
 
-    def windows(self, instants: int | bytes) -> dict[str, Any]:
+    def windows(self, instants: int | bytes) -> WindowCache:
         """Return a cache of windows' results at an instant, or at some; evaluation fills it."""
-        return self._windows.setdefault(instants, {})
+        return self._windows.setdefault(instants, WindowCache())
 
     def all_of(self, wanted: Mapping[str, Samples]) -> Any:
         """Return at which instants all samples are fresh; they are named by their time axis."""

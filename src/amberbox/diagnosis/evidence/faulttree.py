@@ -32,6 +32,7 @@ from amberbox.diagnosis.diagnose import (
     evidence_of_situation,
 )
 from amberbox.diagnosis.faulttree.analysis import Analysis, analyse, ranked
+from amberbox.diagnosis.faulttree.probable import union_bounds
 from amberbox.diagnosis.faulttree.tree import BooleanConstant, FaultTree, Gate, all_of, any_of
 from amberbox.diagnosis.fmea.fault_trees import tree_over
 from amberbox.diagnosis.fmea.model import Fmea, lost
@@ -173,8 +174,9 @@ def _best(knowledge: Knowledge, known: Evidence, tree: FaultTree, effort: Effort
     They are evaluated in order of their upper bounds, so that the search can end once no further
     set can be better.
     """
-    analysis = analyse(tree, budget=Budget(_NODES, effort.budget.is_over))
-    if analysis.cut_sets is None:
+    asked = effort.budget
+    analysis = analyse(tree, budget=Budget(_NODES, asked.is_over, is_past=asked.is_past))
+    if analysis.cut_sets is None and analysis.probable is None:
         return _Found(incomplete=analysis.incomplete)
     priors = {name: tree.events[name].probability or 0.0 for name in analysis.events}
     at_most = dict(priors)  # less where a symptom that the failure mode shows is surely absent
@@ -184,10 +186,12 @@ def _best(knowledge: Knowledge, known: Evidence, tree: FaultTree, effort: Effort
             at_most[link.cause] *= 1.0 - link.detects
     best: list[tuple[float, int, frozenset[str]]] = []
     looked_at, spent, total = 0, 0.0, 0.0
-    for faults in ranked(analysis, at_most):
+    candidates = ranked(analysis, at_most) if analysis.cut_sets is not None else _probable(analysis)
+    for faults in candidates:
         bound = _product(at_most, faults)
         full = len(best) == effort.hypotheses
-        if looked_at == _MOST_LOOKED_AT or (full and best[0][0] >= bound):
+        ends = full and best[0][0] >= bound and analysis.cut_sets is not None
+        if looked_at == _MOST_LOOKED_AT or ends:
             break
         looked_at, spent = looked_at + 1, spent + bound
         weight = _product(priors, faults) * likelihood(knowledge.model, known, faults)
@@ -195,6 +199,8 @@ def _best(knowledge: Knowledge, known: Evidence, tree: FaultTree, effort: Effort
         heapq.heappush(best, (weight, -looked_at, faults))
         if full:
             heapq.heappop(best)
+    if analysis.cut_sets is None:
+        return _shares_of_probable(sorted(best, reverse=True), total, priors, analysis)
     rest = max(0.0, analysis.cut_sets.rare_event_sum(at_most) - spent)
     return _shares(sorted(best, reverse=True), total, rest, analysis, effort)
 
@@ -209,6 +215,24 @@ def _shares(
     is_cut = covered < effort.mass and len(best) < every
     cut = f"the {len(best)} most probable of {every:,} minimal cut sets" if is_cut else ""
     return _Found(sets, covered, cut)
+
+
+def _probable(analysis: Analysis) -> tuple[frozenset[str], ...]:
+    return analysis.probable.sets if analysis.probable is not None else ()
+
+
+def _shares_of_probable(
+    best: list[tuple[float, int, frozenset[str]]], total: float, priors: Mapping[str, float],
+    analysis: Analysis,
+) -> _Found:  # fmt: skip
+    """Return shares where not all cut sets are known: the rest is what the bounds leave open."""
+    sets = tuple((faults, weight / total) for weight, _, faults in best if weight > 0.0)
+    covered = 0.0
+    if sets and analysis.bounds is not None and analysis.probable is not None:
+        by_sets, _ = union_bounds(analysis.probable, priors)
+        rest = max(0.0, analysis.bounds.upper - by_sets)
+        covered = sum(weight for weight, _, _ in best) / (total + rest)
+    return _Found(sets, covered, analysis.incomplete)
 
 
 def _product(chances: Mapping[str, float], faults: Iterable[str]) -> float:

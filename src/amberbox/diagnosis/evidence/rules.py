@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 from amberbox.core.config import raise_errors
@@ -33,7 +34,7 @@ from amberbox.diagnosis.prolog.machine import (
     ProofNode,
     Virtual,
 )
-from amberbox.diagnosis.prolog.program import Fact, Program, read_rules
+from amberbox.diagnosis.prolog.program import Fact, Program, reachable, read_rules
 from amberbox.diagnosis.prolog.query import Answer, ask, python_value
 from amberbox.diagnosis.prolog.syntax import read_goal, write
 from amberbox.diagnosis.prolog.terms import RuleError, StoppedError, key_of, show_key
@@ -171,12 +172,15 @@ class RuleFindings:
     conflicts: tuple[frozenset[str], ...] = ()
     findings: tuple[str, ...] = ()
     proofs: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[frozenset[str], str] = field(default_factory=dict)
+    """The finding that proves each conflict."""
 
     def items(self) -> Iterator[EvidenceItem]:
         """Yield them as evidence."""
         yield from self.symptoms
         for conflict in self.conflicts:
-            yield Conflict(conflict, SOURCE, self.proofs[_name(conflict)])
+            proof, name = self.proofs[_name(conflict)], self.names.get(conflict, "")
+            yield Conflict(conflict, SOURCE, proof, name)
         yield from (Finding(text, SOURCE) for text in self.findings)
 
     def faults(self, fmea: Fmea) -> dict[str, list[str]]:
@@ -221,16 +225,30 @@ ALONE = "By the rules alone, which weigh nothing else:"
 NOTHING = "nothing follows from them"
 NO_ANSWERS = "answers to tests count for nothing where the rules alone are asked"
 _NEEDS = EvidenceNeeds(history_s=86_400.0)
+_OF_SYMPTOMS = EvidenceNeeds()
+LOOKED_UP = frozenset({
+    *("holds", "holds_throughout", "mission", "mission_name", "mission_parameter"),
+    *("now", "state", "status"),
+})  # fmt: skip
+"""Predicates whose answers come from the record, and change as it grows."""
+_CALLS = frozenset({"call", "maplist", "foldl", "include", "exclude"})  # may call any of them
 
 
 def needs(knowledge: Knowledge, folder: Path) -> EvidenceNeeds | None:
-    """Return that rules need a day of the record; None for a folder without rules."""
-    return _NEEDS if rule_files(folder) else None
+    """Return that rules need a day of the record, if those that the FMEA names look anything up.
+
+    None for a folder without rules; raises ConfigurationError with all their problems.
+    """
+    if not rule_files(folder):
+        return None
+    goals = [read_goal(of.goal).term for of in knowledge.fmea.findings if of.goal]
+    names = {name for name, _ in reachable(goals, _program(knowledge, folder).known)}
+    return _NEEDS if names & (LOOKED_UP | _CALLS) else _OF_SYMPTOMS
 
 
 def provide(knowledge: Knowledge, window: EvidenceWindow) -> Iterator[EvidenceItem]:
     """Yield the findings of the folder's rules; raises ConfigurationError with all problems."""
-    program = _program(window.folder)
+    program = _with_known_facts(_RobotRules(window.folder, knowledge))
     facts = _facts(knowledge, window)
     yield from rule_findings(program, knowledge.fmea, facts, window.at_ns).items()
 
@@ -239,21 +257,61 @@ def alone(knowledge: Knowledge, window: EvidenceWindow, case: DiagnosisContext) 
     """Return the diagnosis by the folder's rules; raises UsageError if it has none."""
     if not rule_files(window.folder):
         raise UsageError(f"there are no rules/*.pl in {window.folder}", "see docs/robot/rules.md")
-    facts = _facts(knowledge, window)
-    made = conclude(knowledge, _program(window.folder), facts, diagnosis_id_of(knowledge, case))
+    known = known_facts(knowledge.robot, knowledge.fmea, knowledge.exposure_h)
+    facts = replace(_facts(knowledge, window), known=tuple(known))
+    made = conclude(
+        knowledge, _program(knowledge, window.folder), facts, diagnosis_id_of(knowledge, case)
+    )
     return made if made.hypotheses or made.findings else None
 
 
-def _program(folder: Path) -> Program:
+@dataclass(frozen=True, eq=False)
+class _RobotRules:
+    """The rules of a folder with what its FMEA says; equal ones have equal files."""
+
+    folder: Path
+    knowledge: Knowledge
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        of = self.knowledge
+        return self.folder, of.config_hash, of.robot, of.exposure_h
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _RobotRules) or not self.knowledge.config_hash:
+            return self is other
+        return self._key == other._key
+
+
+def _program(knowledge: Knowledge, folder: Path) -> Program:
+    return _read_once(_RobotRules(folder, knowledge))
+
+
+@lru_cache(maxsize=4)
+def _read_once(rules: _RobotRules) -> Program:
+    return _read(rules.folder)
+
+
+@lru_cache(maxsize=4)
+def _with_known_facts(rules: _RobotRules) -> Program:
+    of = rules.knowledge
+    return _read_once(rules).with_facts(known_facts(of.robot, of.fmea, of.exposure_h), FMEA)
+
+
+def _read(folder: Path) -> Program:
     program = read_rules(rule_files(folder))
     raise_errors(program.problems())
     return program
 
 
 def _facts(knowledge: Knowledge, window: EvidenceWindow) -> Facts:
-    known = known_facts(knowledge.robot, knowledge.fmea, knowledge.exposure_h)
-    seen = seen_facts(window.symptoms, knowledge.fmea)
-    return Facts(tuple(known), tuple(seen), tuple(window.lookups(_NEEDS)))
+    """Return the facts of the instant; those of the FMEA are known besides."""
+    others = (symptom for symptom in window.symptoms if symptom.source != SOURCE)
+    seen = seen_facts(others, knowledge.fmea)
+    return Facts((), tuple(seen), tuple(window.lookups(_NEEDS)))
 
 
 def conclude(
@@ -297,6 +355,7 @@ class _Collected:
         self._evidence: dict[str, dict[tuple[str, int, int], None]] = {}
         self._onsets_ns: dict[str, list[int]] = {}
         self._conflicts: dict[str, frozenset[str]] = {}
+        self._names: dict[frozenset[str], str] = {}
         self._texts: list[str] = []
         self._proofs: dict[str, list[str]] = {}
 
@@ -327,6 +386,7 @@ class _Collected:
         name = symptom_of(of, values)
         if of.proves:
             conflict = frozenset(faults)
+            self._names.setdefault(conflict, name)
             name = _name(conflict)
             self._conflicts[name] = conflict
         else:
@@ -369,7 +429,8 @@ class _Collected:
         symptoms = tuple(self._symptom(name, tuple(of)) for name, of in self._evidence.items())
         proofs = {name: "\n".join(dict.fromkeys(texts)) for name, texts in self._proofs.items()}
         texts = tuple(dict.fromkeys(self._texts))
-        return RuleFindings(symptoms, tuple(self._conflicts.values()), texts, proofs)
+        conflicts = tuple(self._conflicts.values())
+        return RuleFindings(symptoms, conflicts, texts, proofs, self._names)
 
     def _symptom(self, name: str, evidence: Measured) -> Symptom:
         onset_ns = min(self._onsets_ns[name], default=self._at_ns)

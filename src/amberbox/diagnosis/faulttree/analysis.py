@@ -19,6 +19,8 @@ from amberbox.core.config import raise_errors
 from amberbox.core.contracts import Budget
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Diagnosis
+from amberbox.diagnosis.faulttree.bounded import BoundedSearch, quick_bounds
+from amberbox.diagnosis.faulttree.bounds import ProbabilityBounds, least_given, rough_bounds
 from amberbox.diagnosis.faulttree.decision_diagrams import (
     DiagramNodes,
     ExhaustedError,
@@ -26,8 +28,23 @@ from amberbox.diagnosis.faulttree.decision_diagrams import (
     cut_sets_of,
     solve,
 )
-from amberbox.diagnosis.faulttree.graph import build_fault_graph, coherent
-from amberbox.diagnosis.faulttree.tree import FaultTree, Name, below, problems
+from amberbox.diagnosis.faulttree.graph import (
+    FaultGraph,
+    FaultTreeModule,
+    build_fault_graph,
+    coherent,
+    split_modules,
+)
+from amberbox.diagnosis.faulttree.probable import ProbableCutSets, repairing_events, union_bounds
+from amberbox.diagnosis.faulttree.tree import (
+    BooleanConstant,
+    FaultTree,
+    Name,
+    all_of,
+    any_of,
+    below,
+    problems,
+)
 
 _NEVER = (float("inf"), 0)
 # What an event still costs: first what counts, then how many events are missing
@@ -399,6 +416,10 @@ class Analysis:
     ended; those of a tree that is not ``coherent`` are the positive parts of its minimal solutions.
     ``truncated_at`` is the order limit if there was one: then larger cut sets are not counted.
     ``incomplete`` names the budget and what it ended; empty if the analysis is complete.
+
+    What is not known exactly is bounded: ``bounds`` of the probability (both are the exact one
+    where that is known), and ``probable`` instead of ``cut_sets``: those that are most probable.
+    They are None only where no time was left.
     """
 
     tree: FaultTree
@@ -411,6 +432,8 @@ class Analysis:
     truncated_at: int | None = None
     incomplete: str = ""
     without_probability: tuple[str, ...] = ()
+    bounds: ProbabilityBounds | None = None
+    probable: ProbableCutSets | None = None
 
     @property
     def minimal_cut_sets(self) -> int | None:
@@ -446,7 +469,7 @@ def analyse(
     importance: bool = False,
     budget: Budget | None = None,
 ) -> Analysis:
-    """Solve a fault tree exactly.
+    """Solve a fault tree, exactly if the budget suffices.
 
     ``order_limit`` leaves cut sets of more events out; the probability stays exact. Raises
     ConfigurationError for a tree with a cycle, a gate without input, or the like. A budget that
@@ -454,8 +477,7 @@ def analyse(
     """
     raise_errors(problems(tree))
     budget = budget or Budget()
-    formulas = {name: gate.formula for name, gate in tree.gates.items()}
-    graph, top = build_fault_graph(formulas, tree.houses, Name(tree.top))
+    graph, top = _graph(tree)
     gates, events = below(tree)
     unknown = tuple(name for name in events if tree.events[name].probability is None)
     known = Analysis(
@@ -466,19 +488,31 @@ def analyse(
         truncated_at=order_limit,
         without_probability=unknown,
     )
+    parts = split_modules(graph, top)
+    solved: list[SolvedModule] = []
     try:
-        solved = solve(graph, top, budget)
+        solved.extend(solve(graph, parts, budget.until(_TIME_TO_BE_EXACT)))
     except ExhaustedError as error:
-        return replace(known, incomplete=f"probability and cut sets: {error.reason}")
+        known = replace(known, incomplete=f"probability and cut sets: {error.reason}")
+        orders = {parts[len(solved)].vertex: error.order} if error.order else {}
+        return _bounded(known, graph, parts, solved, budget, orders)
     if not unknown:
         known = _with_probability(known, solved, importance)
-    return _with_cut_sets(known, solved, budget)
+    known = _with_cut_sets(known, solved, budget.until(_TIME_TO_BE_EXACT))
+    return _bounded(known, graph, parts, solved, budget) if known.incomplete else known
+
+
+def _graph(tree: FaultTree) -> tuple[FaultGraph, int]:
+    formulas = {name: gate.formula for name, gate in tree.gates.items()}
+    return build_fault_graph(formulas, tree.houses, Name(tree.top))
 
 
 def _with_probability(known: Analysis, solved: list[SolvedModule], importance: bool) -> Analysis:
     of_event = _known(known.tree, known.events)
     factors = importance_of(solved, of_event) if importance else {}
-    return replace(known, top_probability=top_probability(solved, of_event), importance=factors)
+    top = top_probability(solved, of_event)
+    bounds = ProbabilityBounds(top, top)
+    return replace(known, top_probability=top, importance=factors, bounds=bounds)
 
 
 def _with_cut_sets(known: Analysis, solved: list[SolvedModule], budget: Budget) -> Analysis:
@@ -488,6 +522,107 @@ def _with_cut_sets(known: Analysis, solved: list[SolvedModule], budget: Budget) 
         return replace(known, incomplete=f"cut sets: {error.reason}")
     leaves = tuple(part.leaves for part in solved)
     return replace(known, cut_sets=CutSets(leaves, tuple(sets), known.truncated_at))
+
+
+_TIME_TO_BE_EXACT = 0.5
+_NONE: Mapping[int, tuple[int, ...]] = {}
+_MOST_JOINED = 500  # cut sets whose joint probability is looked at more closely
+_ANY = 0.1  # for events without probability: then the smallest cut sets come first
+
+
+def _bounded(
+    known: Analysis, graph: FaultGraph, parts: Sequence[FaultTreeModule],
+    solved: Sequence[SolvedModule], budget: Budget, orders: Mapping[int, tuple[int, ...]] = _NONE,
+) -> Analysis:  # fmt: skip
+    """Add bounds of what could not be solved."""
+    with_bounds = known.bounds is None and not known.without_probability
+    of_event = _known(known.tree, known.events)
+    if known.without_probability:
+        of_event = dict.fromkeys(known.events, _ANY)
+    done = _values(solved, of_event)[0] if with_bounds else []
+    of_part = {part.vertex: values[-1] for part, values in zip(parts, done, strict=False)}
+    search = BoundedSearch(graph, parts, of_part, of_event, budget, orders)
+    search.run(with_bounds)
+    if not with_bounds or (search.bounds is None and search.sets is None):
+        return replace(known, probable=search.sets)
+    found = search.bounds or rough_bounds(graph, parts, of_event)
+    by_sets = _by_sets(search.sets, of_event)[0] if search.sets is not None else 0.0
+    bounds = ProbabilityBounds(min(found.upper, max(found.lower, by_sets)), found.upper)
+    return replace(known, bounds=bounds, probable=search.sets)
+
+
+@dataclass(frozen=True, slots=True)
+class MostProbable:
+    """Minimal cut sets with their probabilities, the most probable first.
+
+    The first ``certain`` are surely the most probable of all. ``share`` are bounds of how much of
+    the top event's probability is due to the sets together; None where the probability is not
+    bounded. Without probabilities (None) the smallest sets come first.
+    """
+
+    sets: tuple[frozenset[str], ...]
+    probabilities: tuple[float, ...] | None
+    certain: int
+    share: tuple[float, float] | None
+
+
+def most_probable(analysis: Analysis, n: int) -> MostProbable | None:
+    """Return the ``n`` most probable minimal cut sets and their share; None if none are known."""
+    found = analysis.probable
+    if analysis.cut_sets is not None:
+        of_event = {name: analysis.tree.events[name].probability for name in analysis.events}
+        sets = tuple(islice(ranked(analysis, of_event), n))
+        chances = tuple(math.prod(of_event[e] or 0.0 for e in sorted(entry)) for entry in sets)
+        found = ProbableCutSets(sets, chances, 0.0, repairing_events(*_graph(analysis.tree)))
+    if found is None:
+        return None
+    limit = analysis.truncated_at
+    places = [p for p, entry in enumerate(found.sets) if limit is None or len(entry) <= limit][:n]
+    certain = sum(place < found.certain for place in places)
+    found = replace(
+        found,
+        sets=tuple(found.sets[place] for place in places),
+        probabilities=tuple(found.probabilities[place] for place in places),
+    )
+    if analysis.without_probability:
+        return MostProbable(found.sets, None, certain, None)
+    return MostProbable(found.sets, found.probabilities, certain, _share(analysis, found))
+
+
+def _share(analysis: Analysis, found: ProbableCutSets) -> tuple[float, float] | None:
+    bounds = analysis.bounds
+    if bounds is None or not bounds.upper:
+        return None
+    of_event = _known(analysis.tree, analysis.events)
+    lower, upper = _by_sets(found, of_event)
+    if found.repairing:
+        graph, top = _graph(analysis.tree)
+        given = least_given(graph, split_modules(graph, top), of_event, found.sets)
+        lower = max(lower, union_bounds(found, of_event, given)[0])
+    least = max(bounds.lower, lower)
+    return min(1.0, lower / bounds.upper), min(1.0, upper / least) if least else 1.0
+
+
+def _by_sets(found: ProbableCutSets, of_event: Mapping[str, float]) -> tuple[float, float]:
+    """Return bounds of the probability that the top event happens by one of the sets."""
+    lower, upper = union_bounds(found, of_event)
+    if not found.sets:
+        return lower, upper
+    joined = _joined_bounds(found.sets[:_MOST_JOINED], of_event)
+    if len(found.sets) <= _MOST_JOINED:
+        upper = min(upper, joined.upper)
+    return lower if found.repairing else max(lower, joined.lower), upper
+
+
+def _joined_bounds(
+    sets: Sequence[frozenset[str]], of_event: Mapping[str, float]
+) -> ProbabilityBounds:
+    """Return bounds of the probability that all events of one of the sets happen."""
+    formula = any_of(
+        *(all_of(*sorted(entry)) if entry else BooleanConstant(True) for entry in sets)
+    )
+    graph, top = build_fault_graph({}, {}, formula)
+    return quick_bounds(graph, split_modules(graph, top), of_event)
 
 
 def _known(tree: FaultTree, events: Sequence[str]) -> dict[str, float]:
@@ -612,7 +747,8 @@ def nearest(analysis: Analysis, diagnosis: Diagnosis | None, n: int = 5) -> list
     Under each hypothesis its faults have happened and all other events have the probability of the
     tree; hypotheses exclude each other. The remaining probability, and all of it without a
     diagnosis, is no evidence about any event. The result is exact: no other cut set is more
-    probable. Raises AmberboxError when the cut sets or probabilities are not known.
+    probable. If the cut sets are too many, it is the best of ``analysis.probable``. Raises
+    AmberboxError when neither they nor probabilities are known.
     """
     if analysis.without_probability:
         what = f"the event {analysis.without_probability[0]} has no probability"
@@ -625,6 +761,8 @@ def nearest(analysis: Analysis, diagnosis: Diagnosis | None, n: int = 5) -> list
     rest = max(0.0, 1.0 - sum(chances.values()))
     chances[frozenset()] = chances.get(frozenset(), 0.0) + rest
     worlds = [_World(chance, faults) for faults, chance in chances.items() if chance > 0.0]
+    if analysis.cut_sets is None and analysis.probable is not None:
+        return _ranked(analysis, worlds, analysis.probable.sets, n)
     count = n
     while True:
         listed = [(world, _listed(analysis, world, count)) for world in worlds]

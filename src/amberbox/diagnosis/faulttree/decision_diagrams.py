@@ -14,25 +14,25 @@ from amberbox.diagnosis.faulttree.graph import (
     TRUE,
     FaultGraph,
     FaultTreeModule,
-    split_modules,
     variable_orders,
 )
 
 CHECK_EVERY = 4096  # steps between two checks of the deadline; a power of two
-# The most nodes that are held at a time by default, of about 200 bytes each
-MOST_NODES = 10_000_000
+# The most nodes that are held at a time by default, of up to 300 bytes each
+MOST_NODES = 1_400_000
 
 
 class ExhaustedError(Exception):
     """A budget was used up; ``reason`` names it, in words for the result.
 
-    ``done`` counts the completed steps.
+    ``done`` counts the completed steps; ``order`` is the most promising order of the variables.
     """
 
-    def __init__(self, reason: str, done: int = 0) -> None:
+    def __init__(self, reason: str, done: int = 0, order: tuple[int, ...] = ()) -> None:
         super().__init__(reason)
         self.reason = reason
         self.done = done
+        self.order = order
 
 
 def check_budget(budget: Budget, held: int) -> None:
@@ -113,7 +113,7 @@ class Diagram:
         return result
 
     def any_of(self, nodes: Iterable[int]) -> int:
-        """Return the OR of many nodes, those with the lowest variables first."""
+        """Return the OR of many nodes, as ``all_of`` does the AND."""
         result = 0
         for node in self._from_below(nodes):
             result = self.disjunction(node, result)
@@ -362,24 +362,24 @@ class SolvedModule:
     decisions: DiagramNodes
 
 
-def solve(graph: FaultGraph, top: int, budget: Budget) -> list[SolvedModule]:
-    """Return the decision diagrams of all parts of a graph, the top one last.
+def solve(
+    graph: FaultGraph, parts: Iterable[FaultTreeModule], budget: Budget
+) -> Iterator[SolvedModule]:
+    """Yield the decision diagrams of the parts of a graph (``split_modules``), the top one last.
 
     Raises ExhaustedError when the budget does not suffice.
     """
-    solved: list[SolvedModule] = []
     numbers: dict[int, int] = {}
     held = 0
-    for part in split_modules(graph, top):
+    for part in parts:
         left = _left(budget, held)
         order, decisions = _decisions(graph, part, left)
         leaves = tuple(
             numbers[leaf] if leaf in numbers else graph.vertices[leaf].event for leaf in order
         )
-        numbers[part.vertex] = len(solved)
-        solved.append(SolvedModule(leaves, decisions))
+        numbers[part.vertex] = len(numbers)
         held += len(decisions)
-    return solved
+        yield SolvedModule(leaves, decisions)
 
 
 def cut_sets_of(
@@ -454,7 +454,7 @@ def _decisions(
                 return order, _build(graph, part, order, replace(budget, nodes=nodes))
             except ExhaustedError as error:
                 if nodes == most or budget.is_over():
-                    raise
+                    raise ExhaustedError(error.reason, error.done, candidates[0]) from error
                 reached.append(error.done)
         ranked = sorted(zip(reached, candidates, strict=True), key=lambda entry: -entry[0])
         candidates = [order for _, order in ranked[: max(_FEWEST_ORDERS, len(ranked) // 2)]]
@@ -489,7 +489,7 @@ def _add(bdd: Diagram, graph: FaultGraph, number: int, made: dict[int, int]) -> 
     """Make the diagram of one gate of those of its inputs."""
     vertex = graph.vertices[number]
     inputs = [made[entry] for entry in vertex.inputs]
-    made[number] = _gate(bdd, vertex.kind, inputs, vertex.count)
+    made[number] = gate_of_diagrams(bdd, vertex.kind, inputs, vertex.count)
     check_budget(bdd.budget, len(bdd))
     bdd.forget()
 
@@ -502,13 +502,12 @@ def _uses(graph: FaultGraph, part: FaultTreeModule) -> dict[int, int]:
     return uses
 
 
-def _gate(bdd: Diagram, kind: str, inputs: Sequence[int], count: int) -> int:
+def gate_of_diagrams(bdd: Diagram, kind: str, inputs: Sequence[int], count: int) -> int:
+    """Return the node of a gate of these inputs."""
     if kind == "and":
         return bdd.all_of(inputs)
     if kind == "or":
         return bdd.any_of(inputs)
     if kind == "atleast":
         return bdd.at_least(count, inputs)
-    if kind == "not":
-        return bdd.negation(inputs[0])
-    return bdd.exclusive(inputs[0], inputs[1])
+    return bdd.negation(inputs[0]) if kind == "not" else bdd.exclusive(inputs[0], inputs[1])

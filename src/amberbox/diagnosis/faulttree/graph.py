@@ -208,6 +208,11 @@ def _flattened(graph: FaultGraph, top: int) -> tuple[FaultGraph, int]:
 _PLAIN = frozenset({"event", "constant"}) | COHERENT
 
 
+def is_plain(graph: FaultGraph, number: int) -> bool:
+    """Return whether a vertex is neither NOT nor XOR."""
+    return graph.vertices[number].kind in _PLAIN
+
+
 @dataclass(frozen=True, slots=True)
 class FaultTreeModule:
     """A vertex and the vertices below it down to events and other parts, its ``leaves``.
@@ -406,7 +411,7 @@ def variable_orders(graph: FaultGraph, part: FaultTreeModule) -> list[tuple[int,
     heights = _by_place(plain, inputs, _heights(inputs), max)
     middles = _by_place(plain, inputs, _heights(inputs), _mean)
     depths = _by_place(plain, inputs, _depths(part.vertex, inputs), max)
-    found = [shared_first, large_first, heights, plain, depths, small_first, middles]
+    found = [shared_first, small_first, large_first, plain, heights, depths, middles]
     improvable = (shared_first, plain, heights, depths, large_first)
     found += [_forced(order, inputs) for order in improvable]
     return list(dict.fromkeys(found))

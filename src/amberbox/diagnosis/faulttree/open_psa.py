@@ -339,6 +339,13 @@ _NOT_READ = {
     "define-extern-library": "external functions",
     "define-extern-function": "external functions",
 }
+_NEEDED = {
+    "included files": OTHER_FILES,
+    "event trees": "write each sequence as a gate: <and> of the initiating event, as a basic event "
+    "with a probability, of the gates of the branches that fail, and <not> of those that succeed; "
+    "then choose it with --effect",
+    "mission phases": "give the phase's time with --mission-time and set its house events",
+}
 
 
 def read_mef(
@@ -353,14 +360,19 @@ def read_mef(
     choose from.
     """
     paths = [path] if isinstance(path, str | FilePath) else list(path)
-    scope = MefScope([])
-    roots = [root for given in paths if (root := _root(str(given), scope.problems)) is not None]
-    _refuse(scope)
-    for root in roots:
-        _collect(root, scope)
-    tree = _tree(scope, roots, top, mission_time_h)
-    _refuse(scope)
-    return tree
+    model = _model(paths, mission_time_h)
+    return model.tree(_top(model.gates, top, ", ".join(map(str, paths))))
+
+
+def read_mef_trees(
+    paths: Sequence[FilePath | str], mission_time_h: float = DEFAULT_MISSION_TIME_H
+) -> list[FaultTree]:
+    """Read files as one model and return a tree for each gate that no other gate uses.
+
+    Raises ConfigurationError with the line of every error.
+    """
+    model = _model(paths, mission_time_h)
+    return [model.tree(top) for top in tops(model.gates)]
 
 
 def _root(file: str, problems: list[Problem]) -> MefElement | None:
@@ -414,8 +426,8 @@ def _allowed(tag: str) -> tuple[str, ...]:
 
 def _unknown(element: MefElement, inside: MefElement, scope: MefScope) -> None:
     if element.tag in _NOT_READ:
-        what, hint = f"{_NOT_READ[element.tag]} are not supported", "write the gates out"
-        hint = OTHER_FILES if element.tag == "include" else hint
+        what = f"{_NOT_READ[element.tag]} are not supported"
+        hint = _NEEDED.get(_NOT_READ[element.tag], "write the gates out")
     else:
         known = (*_allowed(inside.tag), "label", "attributes")
         what = f"unknown element in <{inside.tag}>"
@@ -423,9 +435,35 @@ def _unknown(element: MefElement, inside: MefElement, scope: MefScope) -> None:
     scope.fail(element, f"<{element.tag}>", what, hint)
 
 
-def _tree(
-    scope: MefScope, roots: Sequence[MefElement], top: str, mission_time_h: float
-) -> FaultTree:
+@dataclass(frozen=True)
+class _Model:
+    """What files define together; ``scope`` and ``roots`` are their elements."""
+
+    scope: MefScope
+    roots: Sequence[MefElement]
+    gates: dict[str, Gate]
+    events: dict[str, BasicEvent]
+    houses: dict[str, bool]
+    parameters: dict[str, MefParameter]
+    mission_time_h: float
+
+    def tree(self, top: str) -> FaultTree:
+        """Return the tree below a gate; raises ConfigurationError with all its problems."""
+        name = _tree_name(self.scope.known[False, top], self.roots)
+        tree = FaultTree(
+            name, top, self.gates, self.events, self.houses, self.parameters, self.mission_time_h
+        )
+        self.scope.problems += problems(tree, _places(self.scope))
+        _refuse(self.scope)
+        return tree
+
+
+def _model(paths: Sequence[FilePath | str], mission_time_h: float) -> _Model:
+    scope = MefScope([])
+    roots = [root for given in paths if (root := _root(str(given), scope.problems)) is not None]
+    _refuse(scope)
+    for root in roots:
+        _collect(root, scope)
     gates = {entry.name: _gate(entry, scope) for entry in scope.of_kind("gate")}
     houses = {entry.name: _house(entry, scope) for entry in scope.of_kind("house event")}
     parameters = {entry.name: _parameter(entry, scope) for entry in scope.of_kind("parameter")}
@@ -434,21 +472,15 @@ def _tree(
         entry.name: _event(entry, scope, values, mission_time_h)
         for entry in scope.of_kind("basic event")
     }
-    files = [root.file for root in roots]
-    file = files[0]
     path = cycle(gates)
     if path:
         what = f"the gate depends on itself: {' > '.join(path)}"
         hint = "take one of these inputs out"
         scope.problems.append(_places(scope).problem(path[0], what, hint))
     elif not gates and not scope.problems:
-        scope.problems.append(Problem(file, 1, "file", "defines no gate"))
+        scope.problems.append(Problem(roots[0].file, 1, "file", "defines no gate"))
     _refuse(scope)
-    chosen = _top(gates, top, ", ".join(files))
-    name = _tree_name(scope.known[False, chosen], roots)
-    tree = FaultTree(name, chosen, gates, events, houses, parameters, mission_time_h)
-    scope.problems += problems(tree, _places(scope))
-    return tree
+    return _Model(scope, roots, gates, events, houses, parameters, mission_time_h)
 
 
 def _places(scope: MefScope) -> DefinitionLines:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from amberbox.core.errors import Problem, did_you_mean
+from amberbox.diagnosis.faulttree.periodic_test import periodic_test
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,7 @@ FUNCTIONS: Mapping[str, tuple[int, int | None, Callable[..., float]]] = {
     "exponential": (2, 2, _exponential),
     "GLM": (4, 4, _glm),
     "Weibull": (4, 4, _weibull),
+    "periodic-test": (0, None, periodic_test),  # 4, 5 or 11
     "uniform-deviate": (2, 2, lambda low, high: (low + high) / 2),
     "normal-deviate": (2, 2, lambda mean, sigma: mean),
     "lognormal-deviate": (3, 3, lambda mean, factor, level: mean),

@@ -186,15 +186,19 @@ class FmeaCoverage:
 def coverage(fmea: Fmea, watched: Collection[str] = (), weak_below: float = 0.9) -> FmeaCoverage:
     """Compare failure modes with symptoms; ``watched`` are the addresses monitors can alarm on.
 
+    Conditions that only a component's faults of unknown kind show are explained by these, and what
+    an explained condition reads as well.
     ``weak`` are modes that even all their symptoms together show with less than ``weak_below``.
     """
     links = links_by_mode(fmea)
     missed = {mode: miss_probability(of) for mode, of in links.items()}
     unseen = {m.id: m.unobservable for m in fmea.modes.values() if missed[m.id] >= 1.0}
-    by_signature: dict[frozenset[tuple[str, bool]], list[str]] = {}
+    by_signature: dict[frozenset[tuple[str, object]], list[str]] = {}
     for mode, of in links.items():
         if mode not in unseen:
-            signature = frozenset((link.symptom, link.detects >= _EXPECTED) for link in of)
+            signature = frozenset(
+                (link.symptom, (link.detects >= _EXPECTED, link.size, link.after_s)) for link in of
+            )
             by_signature.setdefault(signature, []).append(mode)
     groups = [
         _ambiguous_modes(fmea, modes, {symptom for symptom, _ in signature})
@@ -202,6 +206,10 @@ def coverage(fmea: Fmea, watched: Collection[str] = (), weak_below: float = 0.9)
     ]
     explained = {link.symptom for of in links.values() for link in of}
     explained |= {link.symptom for f in fmea.functions.values() for link in f.symptoms}
+    if fmea.other.share:
+        explained.update(name for names in fmea.unshown().values() for name in names)
+    conditions = (s.condition for name, s in fmea.symptoms.items() if name in explained)
+    explained |= {address for one in conditions if one is not None for address in one.addresses()}
     all_symptoms = dict.fromkeys((*watched, *fmea.symptoms))
     return FmeaCoverage(
         len(fmea.modes),

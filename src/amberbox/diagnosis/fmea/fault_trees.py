@@ -11,7 +11,7 @@ from typing import Any
 from amberbox.core.names import component_id
 from amberbox.core.needs import Needs
 from amberbox.core.types import Diagnosis
-from amberbox.diagnosis.faulttree.analysis import Analysis, NearCutSet, nearest
+from amberbox.diagnosis.faulttree.analysis import Analysis, NearCutSet, most_probable, nearest
 from amberbox.diagnosis.faulttree.tree import (
     BasicEvent,
     BooleanConstant,
@@ -112,10 +112,13 @@ FACTORS = ("mif", "cif", "dif", "raw", "rrw")  # measures of how much an event m
 
 
 def analysis_json(
-    analysis: Analysis, importance: bool = False, cut_sets: int = 0
+    analysis: Analysis, importance: bool = False, cut_sets: int = 0, probable: int = 0
 ) -> dict[str, Any]:
-    """Return all numbers; importance and the smallest cut sets if requested."""
-    by_order = analysis.by_order
+    """Return all numbers; importance, the smallest and the most probable cut sets if requested.
+
+    The most probable ones are also there where not all cut sets could be found.
+    """
+    by_order, bounds = analysis.by_order, analysis.bounds
     answer: dict[str, Any] = {
         "top": analysis.tree.top,
         "gates": len(analysis.gates),
@@ -125,6 +128,7 @@ def analysis_json(
         "by_order": None if by_order is None else list(by_order),
         "truncated_at": analysis.truncated_at,
         "top_probability": analysis.top_probability,
+        "probability_bounds": None if bounds is None else [bounds.lower, bounds.upper],
         "rare_event_sum": analysis.rare_event_sum(),
         "min_cut_upper_bound": analysis.upper_bound(),
         "without_probability": list(analysis.without_probability),
@@ -139,7 +143,28 @@ def analysis_json(
         }
     if cut_sets:
         answer["cut_sets"] = [sorted(entry) for entry in smallest_cut_sets(analysis, cut_sets)]
+    if probable or analysis.probable is not None:
+        answer["most_probable"] = most_probable_json(analysis, probable or LISTED)
     return answer
+
+
+LISTED = 10  # most probable cut sets that are shown when not all could be found
+
+
+def most_probable_json(analysis: Analysis, count: int) -> dict[str, Any] | None:
+    """Return the most probable cut sets and their share; None if none could be looked for."""
+    found = most_probable(analysis, count)
+    if found is None:
+        return None
+    chances = found.probabilities or (None,) * len(found.sets)
+    return {
+        "cut_sets": [
+            {"events": sorted(events), "probability": chance}
+            for events, chance in zip(found.sets, chances, strict=True)
+        ],
+        "certain": found.certain,
+        "share": None if found.share is None else list(found.share),
+    }
 
 
 def smallest_cut_sets(analysis: Analysis, count: int) -> list[frozenset[str]]:
@@ -153,29 +178,39 @@ def effects_json(
     exposure_h: float | None = None,
     importance: bool = False,
     cut_sets: int = 0,
+    probable: int = 0,
 ) -> dict[str, Any]:
     """Return the trees of several effects."""
     return {
         "exposure_h": fmea.exposure_h if exposure_h is None else exposure_h,
-        "effects": [effect_json(fmea, analysis, importance, cut_sets) for analysis in found],
+        "effects": [effect_json(fmea, one, importance, cut_sets, probable) for one in found],
         "incomplete": any(analysis.incomplete for analysis in found),
     }
 
 
 def effect_json(
-    fmea: Fmea, analysis: Analysis, importance: bool = False, cut_sets: int = 0
+    fmea: Fmea,
+    analysis: Analysis,
+    importance: bool = False,
+    cut_sets: int = 0,
+    probable: int = 0,
 ) -> dict[str, Any]:
     """Return the tree of one effect, and what its loss means."""
-    shown = analysis_json(analysis, importance, cut_sets)
+    shown = analysis_json(analysis, importance, cut_sets, probable)
     return {"effect": analysis.tree.top, **description(fmea, analysis), **shown}
 
 
 def description(fmea: Fmea, analysis: Analysis) -> dict[str, str]:
-    """Return the description of a tree's top event and the severity of its loss."""
-    function = fmea.functions.get(analysis.tree.top)
-    if function is None:
-        return {"description": fmea.components[analysis.tree.top].description}
-    return {"description": function.description, "severity": function.severity}
+    """Return the description of a tree's top event and the severity of its loss.
+
+    Of a tree that is not made of failure modes, the label of its top gate.
+    """
+    tree = analysis.tree
+    function, component = fmea.functions.get(tree.top), fmea.components.get(tree.top)
+    if function is not None:
+        return {"description": function.description, "severity": function.severity}
+    label = tree.gates[tree.top].label
+    return {"description": component.description if component is not None else label}
 
 
 def _finite(value: float) -> float | None:

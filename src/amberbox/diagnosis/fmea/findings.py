@@ -6,16 +6,24 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import product
 from math import prod
+from typing import Final
 
 from amberbox.core.errors import Problem, did_you_mean
+from amberbox.core.expression import Expression
 from amberbox.core.yaml_nodes import Node
 from amberbox.diagnosis.covering.model import Link, Sign
-from amberbox.diagnosis.fmea.model import FindingMapping, Fmea, FmeaReferences
+from amberbox.diagnosis.fmea.model import FailureMode, FindingMapping, Fmea, FmeaReferences
 from amberbox.diagnosis.fmea.parser import DefaultsFile, FindingFile, ParsedFmea, child_node
 from amberbox.diagnosis.prolog.syntax import Sentence, read_goal, write
 from amberbox.diagnosis.prolog.terms import Key, RuleFault, key_of, show_key, unify
 
 _VARIABLE = re.compile(r"<([A-Za-z_]\w*)>", re.ASCII)
+RULE: Final = "rule:"
+"""Begins the id of a finding of rules."""
+COMBINED: Final = "combined."
+"""Begins the ids ``combined.values.ITEM`` and ``combined.timing.ITEM``: detectors have an alarm."""
+_RARELY = 0.01  # that a failure mode shows where none of its symptoms is measured
+_KINDS = ("values", "timing")
 _MOST = 5_000  # most instances of one finding; more are a mistake in maps_to
 
 Values = Mapping[str, str]  # values of variables by name
@@ -41,7 +49,89 @@ def _mapped(entry: FindingFile, defaults: DefaultsFile) -> FindingMapping:
         defaults.leak if entry.leak is None else entry.leak,
         entry.proves,
         entry.description,
+        0.0 if entry.rule else defaults.hold_s,  # the facts of a rule are remembered already
+        entry.leak is not None,
     )
+
+
+def unusual_findings(
+    modes: Mapping[str, FailureMode],
+    conditions: Mapping[str, Expression],
+    known: FmeaReferences | None,
+    defaults: DefaultsFile,
+    mapped: Collection[FindingMapping] = (),
+) -> tuple[FindingMapping, ...]:
+    """Return the findings that detectors have an alarm about an item, where detectors run.
+
+    Values of the item, and the times of its messages, are two. The causes of each are the failure
+    modes with a symptom that is measured from them, each as probable as one of these symptoms;
+    without any, those of all components whose monitors read it, though each is improbable: it is
+    rather a fault of theirs that is not in the file. Those that the file has ``mapped`` are left
+    out.
+    """
+    detected = known.detected if known is not None else {}
+    misses: dict[str, dict[str, float]] = {}
+    for mode in modes.values() if detected else ():
+        for link in mode.symptoms:
+            for finding in _unusual_by(link.symptom, conditions, detected):
+                of = misses.setdefault(finding, {})
+                of[mode.id] = of.get(mode.id, 1.0) * (1.0 - link.detects)
+    measured = {*misses}
+    for output, addresses in detected.items():
+        component = output.partition("/")[0]
+        own = [mode.id for mode in modes.values() if mode.component == component]
+        items = {_item_of(address) for address in addresses} if own else ()
+        for finding in (f"{COMBINED}{kind}.{item}" for item in items for kind in _KINDS):
+            if finding not in measured:
+                misses.setdefault(finding, {}).update(dict.fromkeys(own, 1.0 - _RARELY))
+    return tuple(
+        FindingMapping(
+            finding=finding,
+            maps_to=tuple(name for name in of if of[name] == miss),
+            detects=1.0 - miss,
+            leak=0.0,  # the calibration states it
+            description=_unusual_text(finding),
+            hold_s=defaults.hold_s,
+        )
+        for finding, of in sorted(misses.items())
+        if finding not in {one.finding for one in mapped}
+        for miss in sorted({*of.values()})
+    )
+
+
+def _unusual_by(
+    symptom: str,
+    conditions: Mapping[str, Expression],
+    detected: Mapping[str, Collection[str]],
+) -> set[str]:
+    """Return the findings about what a symptom is measured from."""
+    condition = conditions.get(symptom)
+    names = condition.addresses() if condition else (symptom,)
+    read = (detected.get(name, () if "/" in name else (name,)) for name in names)
+    return {
+        f"{COMBINED}{'values' if '.' in address else 'timing'}.{_item_of(address)}"
+        for addresses in read
+        for address in addresses
+    }
+
+
+def _unusual_text(finding: str) -> str:
+    kind, item = finding.removeprefix(COMBINED).split(".", 1)
+    return f"detectors find {'values' if kind == 'values' else 'the timing'} of {item} unusual"
+
+
+def readers_of(known: FmeaReferences | None) -> dict[str, frozenset[str]]:
+    """Return the components whose monitors read an address, or an item of it."""
+    found: dict[str, set[str]] = {}
+    for output, addresses in (known.detected if known is not None else {}).items():
+        for address in addresses:
+            for name in (address, _item_of(address)):
+                found.setdefault(name, set()).add(output.partition("/")[0])
+    return {name: frozenset(components) for name, components in found.items()}
+
+
+def _item_of(address: str) -> str:
+    return address.partition(".")[0]
 
 
 def _problems(
@@ -169,12 +259,12 @@ def symptom_of(of: FindingMapping, values: Values) -> str:
     sentence = read_goal(of.goal)
     for name in named & sentence.names.keys() & values.keys():
         sentence.names[name].ref = values[name]
-    return f"rule:{write(sentence.term)}"
+    return f"{RULE}{write(sentence.term)}"
 
 
 def text_of(fmea: Fmea, symptom: str) -> str:
     """Return the text of a symptom that is a finding; empty for any other."""
-    for of in fmea.findings:
+    for of in fmea.all_findings:
         if _is_of(of, symptom):
             origin = f"rule {symptom.removeprefix('rule:')}" if of.goal else f"finding {symptom}"
             return f"{of.description} ({origin})" if of.description else origin
@@ -182,9 +272,15 @@ def text_of(fmea: Fmea, symptom: str) -> str:
 
 
 def causes_of(fmea: Fmea, symptom: str) -> dict[str, float]:
-    """Return the failure modes that a finding indicates, each with its detection probability."""
-    if symptom in fmea.symptoms or not any(_is_of(of, symptom) for of in fmea.findings):
+    """Return the failure modes that a finding indicates, each with its detection probability.
+
+    It is 1 for those of which a finding proves that one is there.
+    """
+    if symptom in fmea.symptoms or not any(_is_of(of, symptom) for of in fmea.all_findings):
         return {}
+    proven = proven_faults(fmea).get(symptom)
+    if proven is not None:
+        return dict.fromkeys(sorted(proven), 1.0)
     return {link.cause: link.detects for link in finding_signs(fmea)[1] if link.symptom == symptom}
 
 
@@ -192,9 +288,9 @@ def _is_of(of: FindingMapping, symptom: str) -> bool:
     """Return whether a symptom is an instance of a finding."""
     if not of.goal:
         return _expression(of.finding).fullmatch(symptom) is not None
-    if not symptom.startswith("rule:"):
+    if not symptom.startswith(RULE):
         return False
-    return unify(read_goal(of.goal).term, read_goal(symptom.removeprefix("rule:")).term, [])
+    return unify(read_goal(of.goal).term, read_goal(symptom.removeprefix(RULE)).term, [])
 
 
 def _filled(pattern: str, values: Values) -> str:
@@ -216,7 +312,29 @@ def named_by_findings(fmea: Fmea) -> frozenset[str]:
     return frozenset(mode for mode in fmea.modes if any(p.fullmatch(mode) for p in patterns))
 
 
+def finding_holds(fmea: Fmea) -> dict[str, float]:
+    """Return for how long each finding is remembered after it has gone, seconds, by its id."""
+    return {
+        name: of.hold_s for of in fmea.all_findings for name, _ in finding_instances(of, fmea.modes)
+    }
+
+
+def proven_faults(fmea: Fmea) -> dict[str, frozenset[str]]:
+    """Return the failure modes of which one is present for sure, by the finding that proves it."""
+    return {
+        name: frozenset(faults)
+        for of in fmea.findings if of.proves
+        for name, faults in finding_instances(of, fmea.modes)
+    }  # fmt: skip
+
+
+def faults_by_finding(fmea: Fmea) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each finding, those that prove included, and the failure modes that it indicates."""
+    for of in fmea.all_findings:
+        yield from finding_instances(of, fmea.modes)
+
+
 def _symptoms(fmea: Fmea) -> Iterator[tuple[str, FindingMapping, tuple[str, ...]]]:
-    for of in fmea.findings:
+    for of in fmea.all_findings:
         for name, faults in finding_instances(of, fmea.modes) if not of.proves else ():
             yield name, of, faults

@@ -13,13 +13,30 @@ from pathlib import Path
 
 from amberbox.core.config import build, raise_errors
 from amberbox.core.errors import AmberboxError, Problem, did_you_mean
-from amberbox.core.expression import Expression
-from amberbox.core.expressions.tree import of_monitors
+from amberbox.core.expression import Expression, parse
+from amberbox.core.expressions.tree import (
+    AddressNode,
+    AgeNode,
+    ArithmeticNode,
+    CallNode,
+    ExpressionNode,
+    WindowNode,
+    children,
+    of_monitors,
+)
 from amberbox.core.names import is_id
-from amberbox.core.needs import NOTHING, Needs, cycles, parse_needs
+from amberbox.core.needs import NOTHING, Needs, all_of, cycles, parse_needs
 from amberbox.core.options import option
+from amberbox.core.types import TestKind
+from amberbox.core.units import is_same_unit, per_second
 from amberbox.core.yaml_nodes import Node, load_yaml, parse_yaml
-from amberbox.diagnosis.fmea.findings import map_findings, named_by_findings
+from amberbox.diagnosis.fmea.blind_spots import few, indistinguishable, unexplained_notes
+from amberbox.diagnosis.fmea.findings import (
+    map_findings,
+    named_by_findings,
+    readers_of,
+    unusual_findings,
+)
 from amberbox.diagnosis.fmea.model import (
     DependencyStructure,
     ExpectedOutcome,
@@ -30,10 +47,13 @@ from amberbox.diagnosis.fmea.model import (
     FmeaReferences,
     FmeaSymptom,
     FmeaTest,
-    Kind,
+    FollowingMode,
     ModeEffects,
     RiskRanks,
+    SizeDistribution,
+    SizeScale,
     SymptomLink,
+    SymptomMeasure,
     UnlistedFault,
     links_by_mode,
     miss_probability,
@@ -44,6 +64,7 @@ from amberbox.diagnosis.fmea.parser import (
     FailureModeFile,
     FmeaFile,
     FunctionFile,
+    LeadsToFile,
     LinkFile,
     MemberFile,
     MemberFunctionFile,
@@ -51,6 +72,7 @@ from amberbox.diagnosis.fmea.parser import (
     RanksFile,
     ResultFile,
     ScalesFile,
+    SizeFile,
     SymptomFile,
     TestFile,
     TypeFile,
@@ -59,6 +81,7 @@ from amberbox.diagnosis.fmea.parser import (
     rate_notes,
     read,
 )
+from amberbox.diagnosis.fmea.runs import MINUTE_S, RunCollector
 
 
 @dataclass(frozen=True)
@@ -122,6 +145,7 @@ class SymptomCollector:
             link = entry if isinstance(entry, LinkFile) else LinkFile(entry)
             symptom = self._symptom(link, child_node(node, place), at, f"{owner}.{place}")
             if symptom is not None:
+                self._judge_size(symptom, link, child_node(node, place), at)
                 found.append(self._link(symptom, link))
         for name in _twice(link.symptom for link in found):
             self._problems.append(node.problem(where, f"'{name}' is there twice"))
@@ -170,20 +194,83 @@ class SymptomCollector:
         named = self._named.get(symptom.id)
         detects = default.detects if link.detects is None else link.detects
         within_s = _first(link.within_s, named.within_s if named else None, default.within_s)
+        within_s = max(within_s, *link.after_s) if link.after_s else within_s
         hold_s = _first(link.hold_s, named.hold_s if named else None, default.hold_s)
         self.found[symptom.id] = replace(
             symptom,
             within_s=max(symptom.within_s, within_s),
             hold_s=max(symptom.hold_s, hold_s),
         )
-        return SymptomLink(symptom.id, detects, within_s, hold_s)
+        return SymptomLink(
+            symptom.id, detects, within_s, hold_s, interval(link.after_s),
+            distribution(link.size),
+        )  # fmt: skip
 
-    def _made(self, name: str, entry: SymptomFile) -> FmeaSymptom:
+    def _judge_size(self, symptom: FmeaSymptom, link: LinkFile, node: Node, where: str) -> None:
+        if link.size is not None and symptom.scale is None and not self._is_wrong(symptom.id):
+            what = f"has a size, but nothing measures {symptom.id}, or its edges are missing"
+            hint = f"symptoms: {{{symptom.id}: {{measure: ..., edges: [2, 5, 10]}}}}"
+            self._problems.append(child_node(node, "size").problem(where, what, hint))
+
+    def _is_wrong(self, name: str) -> bool:
+        """Return whether an entry has edges, but no scale: that is reported already."""
+        entry = self._named.get(name)
+        return entry is not None and bool(entry.edges)
+
+    def _made(self, name: str, entry: SymptomFile, node: Node, where: str) -> FmeaSymptom:
         leak = _first(entry.leak, None, self._defaults.leak)
         within_s, hold_s = entry.within_s or 0.0, entry.hold_s or 0.0
         return FmeaSymptom(
-            name, entry.when, leak, within_s, hold_s, entry.description, entry.by_itself
-        )
+            name, entry.when, leak, within_s, hold_s, entry.description, entry.by_itself,
+            self._scale(name, entry, node, where),
+        )  # fmt: skip
+
+    def _scale(self, name: str, entry: SymptomFile, node: Node, where: str) -> SizeScale | None:
+        """Return the scale of a symptom's size; report one that cannot be measured."""
+        if not entry.edges:
+            if entry.measure is not None:
+                what = "is of no use without edges: [2, 5, 10] are sizes that differ"
+                self._problems.append(child_node(node, "measure").problem(f"{where}.measure", what))
+            return None
+        measures = self._known.measures if self._known else None
+        measure: SymptomMeasure | None
+        if entry.measure is not None:
+            measure = self._measure(entry, node, where)
+        elif measures is None:  # monitors that are not known may measure it
+            measure = SymptomMeasure(parse("null"))
+        elif (measure := measures.get(name)) is None:
+            what = f"nothing measures how large {name} is: give measure: ..."
+            self._problems.append(child_node(node, "edges").problem(f"{where}.edges", what))
+        if measure is None:
+            return None
+        unit = self._unit(measure, entry.unit, child_node(node, "unit"), f"{where}.unit")
+        if unit is None:
+            return None
+        return SizeScale(replace(measure, unit=unit), tuple(entry.edges), entry.settle_s)
+
+    def _unit(self, measure: SymptomMeasure, stated: str, node: Node, where: str) -> str | None:
+        """Return the unit of a measure; None, and a problem, if another one is stated."""
+        units = self._known.units if self._known else {}
+        own = dict(stated_units(measure.expression.tree, units))
+        if measure.unit:
+            own = {"what its monitor measures": measure.unit}
+        for name, unit in own.items() if stated else ():
+            if not is_same_unit(unit, stated):
+                what = f"{name} is in {unit}, not in {stated}; values are not converted"
+                self._problems.append(node.problem(where, what))
+                return None
+        return stated or next(iter(own.values()), "")
+
+    def _measure(self, entry: SymptomFile, node: Node, where: str) -> SymptomMeasure | None:
+        """Return the measure that an entry states, with its addresses resolved."""
+        expression, place = entry.measure, child_node(node, "measure")
+        assert expression is not None, "an entry with a measure"
+        if expression.kind not in ("number", "any"):
+            what = "is no number: it does not say how large the symptom is"
+            self._problems.append(place.problem(f"{where}.measure", what))
+            return None
+        found = self._resolved(expression, place, f"{where}.measure")
+        return None if found is None else SymptomMeasure(found)
 
     def add(
         self, entries: Mapping[str, SymptomFile], node: Node, where: str, component: str = ""
@@ -196,7 +283,7 @@ class SymptomCollector:
             place = child_node(node, short)
             name = f"{component}.{short}" if component and "/" not in short else short
             self._named[name] = entry
-            self.found[name] = self._made(name, entry)
+            self.found[name] = self._made(name, entry, place, f"{where}.{short}")
             self._judge(name, entry, place, f"{where}.{short}")
 
     def _judge(self, name: str, entry: SymptomFile, place: Node, where: str) -> None:
@@ -210,14 +297,54 @@ class SymptomCollector:
         if when.kind not in ("condition", "any"):
             self._problems.append(node.problem(where, "is no condition: it is never true or false"))
             return None
+        return self._resolved(when, node, where)
+
+    def _resolved(self, expression: Expression, node: Node, where: str) -> Expression | None:
         addresses = self._known.addresses if self._known else None
         if addresses is None:
-            return when
+            return expression
         try:
-            return when.resolve(addresses)
+            return expression.resolve(addresses)
         except AmberboxError as error:
             self._problems.append(node.problem(where, error.what, error.hint))
             return None
+
+
+def interval(after_s: Sequence[float]) -> tuple[float, float] | None:
+    """Return an interval of times; None if none is given."""
+    return (after_s[0], after_s[1]) if after_s else None
+
+
+def distribution(size: SizeFile | None) -> SizeDistribution | None:
+    """Return a distribution of sizes; None if none is given."""
+    if size is None:
+        return None
+    if size.uniform:
+        return SizeDistribution("uniform", *size.uniform)
+    return SizeDistribution("normal", *size.normal)
+
+
+def stated_units(tree: ExpressionNode, units: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the units of an expression by the parts that state them; none where it is not known.
+
+    Sums, limits and means are in the unit of what they read, ``age`` is in s, ``rate`` per second.
+    """
+    if isinstance(tree, AddressNode) and tree.name in units:
+        yield tree.name, units[tree.name]
+    elif isinstance(tree, AgeNode):
+        yield f"age({tree.inner.name})", "s"
+    elif isinstance(tree, WindowNode) and tree.name == "rate":
+        for name, unit in stated_units(tree.inner, units):
+            yield f"rate({name})", per_second(unit)
+    elif not (
+        (isinstance(tree, WindowNode | CallNode) and tree.name not in _SAME_UNIT)
+        or (isinstance(tree, ArithmeticNode) and tree.operator not in ("+", "-"))
+    ):
+        for part in children(tree):
+            yield from stated_units(part, units)
+
+
+_SAME_UNIT = ("abs", "min", "max", "median", "mean", "std")
 
 
 def _first(value: float | None, other: float | None, default: float) -> float:
@@ -234,17 +361,20 @@ def _twice(names: Iterator[str]) -> Iterator[str]:
         seen.add(name)
 
 
-MINUTE_S = 60.0
-
-
-def make_test(name: str, entry: TestFile, node: Node, symptoms: SymptomCollector) -> FmeaTest:
-    """Make a test; report one that reads an unknown output."""
-    kind: Kind = "question" if entry.question else "check" if entry.look else "read"
+def make_test(
+    name: str, entry: TestFile, node: Node, symptoms: SymptomCollector, runs: RunCollector
+) -> FmeaTest:
+    """Make a test; report one that reads an unknown output, or runs what does not exist."""
+    if entry.experiment:
+        return runs.make("experiment", entry.experiment, name, entry, node)
+    if entry.unit_test:
+        return runs.make("unit_test", entry.unit_test, name, entry, node)
+    kind: TestKind = "question" if entry.question else "check" if entry.look else "read"
     text = entry.question or entry.look or entry.text or f"Read off {entry.read}."
     if entry.read:
         symptoms.address(entry.read, child_node(node, "read"), f"tests.{name}.read")
     return FmeaTest(
-        name, kind, text, entry.role, entry.minutes * MINUTE_S, entry.risk,
+        name, kind, text, entry.role, _first(entry.minutes, None, 1.0) * MINUTE_S, entry.risk,
         tuple(entry.outcomes), entry.sure,
     )  # fmt: skip
 
@@ -301,6 +431,9 @@ def make_function(name: str, entry: FunctionFile, node: Node, scope: EntryScope)
     links = scope.symptoms.links(entry.symptoms, place, f"{where}.symptoms", name)
     if not is_id(name):
         scope.problems.append(node.problem(where, f"'{name}' is no id: a-z 0-9 _ . - only"))
+    if any(link.after_s is not None for link in links):
+        what = "after_s is for symptoms of failure modes: a loss begins with one of them"
+        scope.problems.append(place.problem(f"{where}.symptoms", what))
     return FmeaFunction(name, needs, entry.description, entry.system, entry.severity, links)
 
 
@@ -324,9 +457,74 @@ def add_failure_mode(part: ExpandedComponent, name: str, scope: EntryScope) -> N
         entry.severity, rate, probability, exposure_h, entry.beta, RiskRanks(),
         ModeEffects(entry.effects.local, tuple(entry.effects.next), tuple(entry.effects.system)),
         links, entry.unobservable, tuple(results), entry.remedy, entry.takes_down,
-        entry.intermittent, node.line, entry.make_safe,
+        entry.intermittent, node.line, entry.make_safe, tuple(entry.recovery),
     )  # fmt: skip
     scope.modes[mode_id] = with_ranks(mode, entry.ranks, scope.file.scales)
+
+
+def tie_modes(sheet: ParsedFmea, scope: EntryScope) -> None:
+    """Add which modes exclude each other and which follow from others, once all are known."""
+    for part in sheet.parts:
+        along = {name: part.modes[name].along_with for name in part.modes}
+        for name, entry in part.modes.items():
+            mode_id, node = f"{part.component}#{name}", part.mode_node(name)
+            where = f"types.{part.type}.failure_modes.{name}"
+            for place, other in enumerate(entry.along_with):
+                if other not in part.modes:
+                    at = child_node(child_node(node, "with"), "along_with", place)
+                    what = f"{part.component} has no mode '{other}'"
+                    near = did_you_mean(other, part.modes)
+                    scope.problems.append(at.problem(f"{where}.with", f"{what}{near}"))
+            excluded = {
+                f"{part.component}#{other}"
+                for other in part.modes
+                if other != name and other not in along[name] and name not in along[other]
+            }
+            scope.modes[mode_id] = replace(
+                scope.modes[mode_id],
+                excludes=frozenset(excluded if sheet.file.defaults.exclusive else ()),
+                leads_to=tuple(_following(entry, part, node, where, scope)),
+            )
+    scope.problems.extend(_tie_problems(sheet, scope.modes))
+
+
+def _following(
+    entry: FailureModeFile, part: ExpandedComponent, node: Node, where: str, scope: EntryScope
+) -> Iterator[FollowingMode]:
+    for name, given in entry.leads_to.items():
+        place = child_node(node, "leads_to", name)
+        follows = given if isinstance(given, LeadsToFile) else LeadsToFile(given)
+        effect = name if "#" in name else f"{part.component}#{name}"
+        if effect not in scope.modes:
+            near = did_you_mean(effect, scope.modes)
+            what = f"there is no failure mode '{effect}'{near}"
+            scope.problems.append(place.problem(f"{where}.leads_to", what))
+        elif not 0 <= follows.p <= 1:
+            what = f"{follows.p:g} is no probability from 0 to 1"
+            scope.problems.append(place.problem(f"{where}.leads_to", what))
+        else:
+            yield FollowingMode(effect, follows.p, interval(follows.after_s))
+
+
+def _tie_problems(sheet: ParsedFmea, modes: Mapping[str, FailureMode]) -> Iterator[Problem]:
+    """Yield circles of consequences, and consequences that their causes exclude."""
+    places = {
+        f"{part.component}#{name}": (part.mode_node(name), part)
+        for part in sheet.parts
+        for name in part.modes
+    }
+    follows = {name: all_of(*(one.mode for one in mode.leads_to)) for name, mode in modes.items()}
+    for circle in cycles(follows):
+        node, part = places[circle[-1]]
+        what = f"leads to itself: {' -> '.join((*circle, circle[0]))}"
+        yield child_node(node, "leads_to").problem(f"types.{part.type}.failure_modes", what)
+    for name, mode in modes.items():
+        for one in mode.leads_to:
+            if one.mode in mode.excludes:
+                node, part = places[name]
+                what = f"it leads to {one.mode}, which it excludes: write with: [...]"
+                where = f"types.{part.type}.failure_modes"
+                yield child_node(node, "leads_to").problem(where, what)
 
 
 def with_ranks(mode: FailureMode, given: RanksFile, scales: ScalesFile) -> FailureMode:
@@ -486,7 +684,25 @@ def check(
         name: replace(mode, effects=_effects(fmea, reach, mode))
         for name, mode in fmea.modes.items()
     }
+    if not any(problem.is_error for problem in problems):
+        problems += _look_the_same(fmea, sheet)
+        problems += unexplained_notes(fmea, known, sheet.root.file) if known else ()
     return replace(fmea, modes=modes)
+
+
+def _look_the_same(fmea: Fmea, sheet: ParsedFmea) -> Iterator[Problem]:
+    """Yield a note for each component with modes that nothing tells apart."""
+    groups = indistinguishable(fmea)
+    for part in sheet.parts:
+        alike = [
+            few([name.partition("#")[2] for name in modes])
+            for modes in groups.get(part.component, ())
+        ]
+        if alike:
+            what = f"nothing tells apart: {few(alike, '; ')}"
+            hint = "give one of them a symptom, a size or a test of its own, or make them one mode"
+            place = child_node(part.node, "failure_modes")
+            yield place.problem(f"{part.type}.failure_modes", what, hint, is_error=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -561,9 +777,15 @@ def _mode_problems(
 ) -> Iterator[Problem]:
     links = links_by_mode(fmea)
     found = named_by_findings(fmea)
+    sized = {link.symptom for of in links.values() for link in of if link.size is not None}
     for mode in fmea.modes.values():
         node = places.get(mode.id) or _member_node(mode, sheet)
         yield from _effect_problems(fmea, reach, mode, node, sheet)
+        for link in mode.symptoms:
+            if link.size is None and link.symptom in sized:
+                what = f"no size of {link.symptom}, for which other modes give one: any will do"
+                where = f"{mode.name}.symptoms"
+                yield child_node(node, "symptoms").problem(where, what, is_error=False)
         has_none = child_node(node, "symptoms") is node  # wrong ones are reported already
         shows = links[mode.id] or mode.id in found
         if has_none and not mode.unobservable and not shows:
@@ -644,10 +866,12 @@ def _made(
 ) -> Fmea | None:
     sheet = read(root, known, problems)
     symptoms = _symptoms(sheet, known, problems)
-    scope = EntryScope(sheet.file, symptoms, _tests(sheet, symptoms), problems)
+    tests = _tests(sheet, symptoms, RunCollector(known, problems))
+    scope = EntryScope(sheet.file, symptoms, tests, problems)
     for part in sheet.parts:
         for name in part.modes:
             add_failure_mode(part, name, scope)
+    tie_modes(sheet, scope)
     functions = {
         name: make_function(name, entry, child_node(root, "functions", name), scope)
         for name, entry in sheet.functions.items()
@@ -655,12 +879,19 @@ def _made(
     components = {part.component: make_component(part) for part in sheet.parts}
     components |= member_components(sheet.robots, root, scope, folder)
     components |= _of_folder(components, functions, sheet)
+    conditions = {n: one.condition for n, one in symptoms.found.items() if one.condition}
     file = sheet.file.other
-    other = UnlistedFault(file.probability, file.detects, file.looks_like, file.together_s)
+    other = UnlistedFault(
+        file.probability, file.detects, file.looks_like, file.together_s, file.share,
+        tuple(file.shows),
+    )  # fmt: skip
+    findings = map_findings(sheet, scope.modes, known, problems)
+    unusual = unusual_findings(scope.modes, conditions, known, sheet.file.defaults, findings)
     fmea = Fmea(
         sheet.file.description, scope.modes, components, functions, symptoms.found, scope.tests,
-        other, sheet.file.exposure_h, map_findings(sheet, scope.modes, known, problems),
+        other, sheet.file.exposure_h, findings,
         member_folders(sheet.robots, folder), sheet.file.remember_s,
+        unusual, readers_of(known),
     )  # fmt: skip
     return check(fmea, sheet, known, problems)
 
@@ -705,15 +936,17 @@ def _symptoms(
     return symptoms
 
 
-def _tests(sheet: ParsedFmea, symptoms: SymptomCollector) -> Mapping[str, FmeaTest]:
+def _tests(
+    sheet: ParsedFmea, symptoms: SymptomCollector, runs: RunCollector
+) -> Mapping[str, FmeaTest]:
     tests = {
-        name: make_test(name, entry, child_node(sheet.root, "tests", name), symptoms)
+        name: make_test(name, entry, child_node(sheet.root, "tests", name), symptoms, runs)
         for name, entry in sheet.tests.items()
     }
     for part in sheet.parts:
         for name, entry in part.tests.items():
             test_id = f"{part.component}.{name}"
             tests[test_id] = make_test(
-                test_id, entry, child_node(part.node, "tests", name), symptoms
+                test_id, entry, child_node(part.node, "tests", name), symptoms, runs
             )
     return tests

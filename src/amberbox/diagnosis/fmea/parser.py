@@ -5,9 +5,11 @@ A wrong entry does not hide what else is wrong; ``docs/robot/fmea.md`` describes
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 from amberbox.core.config import build
@@ -24,6 +26,8 @@ Finding = str | tuple[str, str]
 _MOST = 1e9  # no time, rate or exposure is larger; sums of times stay within 64 bits of nanoseconds
 # A higher rate is a failure every few minutes: likely the time between failures was meant
 MOST_PER_HOUR = 1.0
+MOST_EDGES = 20
+MOST_SHOWS = 4
 _LEAST_PERCENT = 2.0  # A share from here on was meant in percent; 1.2 may as well be 1 with a slip
 
 
@@ -35,6 +39,7 @@ class DefaultsFile:
     leak: float = option(1e-4, "how probable a symptom shows although no cause of it is there")
     within_s: float = option(60.0, "so long after a cause began a symptom may come", unit="s")
     hold_s: float = option(0.0, "so long a symptom that has gone is remembered", unit="s")
+    exclusive: bool = option(False, "whether modes of one component exclude each other")
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
@@ -50,11 +55,21 @@ class OtherFile:
     detects: float = option(0.05, "how probable that shows in a symptom, whichever")
     looks_like: float = option(0.0, "how probable it looks like a failure mode, of several at once")
     together_s: float = option(10.0, "so short after each other these begin", unit="s")
+    share: float = option(0.0, "share of the faults of a component that are not in this file")
+    shows: Sequence[float] = option(
+        (1.0, 8.0), "numbers of symptoms that such a fault shows on average, equally often"
+    )
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
-        yield from _shares(self, "probability", "detects", "looks_like")
+        yield from _shares(self, "probability", "detects", "looks_like", "share")
         yield from _not_below_zero(self, "together_s")
+        if self.share == 1:
+            yield "share", "1 would leave no fault for the failure modes of this file"
+        if not self.shows or any(not 0 < number <= _MOST for number in self.shows):
+            yield "shows", "must be numbers above 0: [1, 8]"
+        elif len(self.shows) > MOST_SHOWS:
+            yield "shows", f"has more than {MOST_SHOWS} numbers"
 
 
 @dataclass(frozen=True)
@@ -98,6 +113,41 @@ class RanksFile:
 
 
 @dataclass(frozen=True)
+class SizeFile:
+    """How large a symptom is when its cause is there; negative sizes have the other sign."""
+
+    uniform: Sequence[float] = option((), "from and to, all equally probable")
+    normal: Sequence[float] = option((), "mean and standard deviation")
+
+    def check(self) -> Iterator[Finding]:
+        """Yield the errors."""
+        if bool(self.uniform) == bool(self.normal):
+            yield "give either uniform: [from, to] or normal: [mean, sd]"
+            return
+        key = "uniform" if self.uniform else "normal"
+        values = self.uniform or self.normal
+        if len(values) != 2 or not all(map(math.isfinite, values)):
+            yield key, "expected two numbers"
+        elif self.uniform and not values[0] < values[1]:
+            yield key, f"nothing is from {values[0]:g} to {values[1]:g}"
+        elif self.normal and values[1] <= 0:
+            yield key, "the standard deviation must be above 0"
+
+
+@dataclass(frozen=True)
+class LeadsToFile:
+    """A failure mode that may follow from another one."""
+
+    p: float = option(doc="how probable it follows")
+    after_s: Sequence[float] = option((), "so long afterwards: [from, to]; any time if absent")
+
+    def check(self) -> Iterator[Finding]:
+        """Yield the errors."""
+        yield from _shares(self, "p")
+        yield from _delay(self)
+
+
+@dataclass(frozen=True)
 class LinkFile:
     """One symptom of a failure mode or of a lost function."""
 
@@ -106,6 +156,8 @@ class LinkFile:
     detects: float | None = option(None, "how probable it shows when the cause is there")
     within_s: float | None = option(None, "so long after the cause began it may come", unit="s")
     hold_s: float | None = option(None, "so long it is remembered when it has gone", unit="s")
+    after_s: Sequence[float] = option((), "it begins so long after the cause: [from, to], seconds")
+    size: SizeFile | None = option(None, "how large it is then, in the unit of its measure")
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
@@ -113,6 +165,7 @@ class LinkFile:
             yield "give either 'symptom' or 'when'"
         yield from _shares(self, "detects")
         yield from _not_below_zero(self, "within_s", "hold_s")
+        yield from _delay(self)
 
 
 @dataclass(frozen=True)
@@ -125,11 +178,23 @@ class SymptomFile:
     hold_s: float | None = option(None, "so long it is remembered when it has gone", unit="s")
     by_itself: bool = option(False, "whether what its component needs has no part in it")
     description: str = option("", "what it is")
+    measure: Expression | None = option(None, "how large it is, signed: temp - 45")
+    unit: str = option("", "unit of the measure")
+    edges: Sequence[float] = option((), "sizes that differ: above 0, rising")
+    settle_s: float = option(
+        2.0, "the largest size of so long after its beginning counts", unit="s"
+    )
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
         yield from _shares(self, "leak")
-        yield from _not_below_zero(self, "within_s", "hold_s")
+        yield from _not_below_zero(self, "within_s", "hold_s", "settle_s")
+        if any(not 0 < edge < math.inf for edge in self.edges):
+            yield "edges", "must be above 0"
+        elif any(not low < high for low, high in pairwise(self.edges)):
+            yield "edges", "must rise: [2, 5, 10]"
+        if len(self.edges) > MOST_EDGES:
+            yield "edges", f"are more than {MOST_EDGES}"
 
 
 @dataclass(frozen=True)
@@ -172,9 +237,16 @@ class FailureModeFile:
     unobservable: str = option("", "why nothing shows it, instead of symptoms")
     tests: Mapping[str, str | ResultFile] = option({}, "outcome of tests when it is there")
     remedy: str = option("", "what to do about it")
+    recovery: Sequence[str] = option((), "actions of the robot that may help")
     make_safe: str = option("", "what to do first, before anybody tests or repairs it")
     takes_down: bool = option(True, "whether the component stops serving")
     intermittent: bool = option(False, "whether it comes and goes")
+    along_with: Sequence[str] = option(
+        (), "modes of the component that it does not exclude", aliases=("with",)
+    )
+    leads_to: Mapping[str, float | LeadsToFile] = option(
+        {}, "failure modes that may follow from it: how probable, and when"
+    )
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
@@ -196,18 +268,34 @@ class TestFile:
     question: str = option("", "what somebody is asked")
     look: str = option("", "what somebody looks at or measures", aliases=("check",))
     read: str = option("", "address of an output that somebody reads off")
-    text: str = option("", "how to read it", aliases=("how",))
+    experiment: str = option("", "name of an experiment (`experiments/`) that is run")
+    unit_test: str = option("", "name of a unit test (`tests/`) that is run")
+    text: str = option("", "how to read it, or what is run", aliases=("how",))
+    passed: str = option("", "answer of a run that passes; the first outcome if not given")
+    moves: bool | None = option(None, "whether the robot moves in the run; else as it declares")
     role: str = option("", "who can do it: operator, technician ...")
-    minutes: float = option(1.0, "how long it takes", unit="min")
+    minutes: float | None = option(
+        None, "how long it takes; else as the experiment declares, or 1", unit="min"
+    )
     risk: float = option(0.0, "how probable it does harm")
     outcomes: Sequence[str] = option(("no", "yes"), "answers; the first is a sound robot's")
     sure: float = option(0.99, "how probable the first answer is when nothing is wrong with it")
 
     def check(self) -> Iterator[Finding]:
         """Yield the errors."""
-        given = [key for key in ("question", "look", "read") if getattr(self, key)]
+        keys = ("question", "look", "read", "experiment", "unit_test")
+        given = [key for key in keys if getattr(self, key)]
         if len(given) != 1:
-            yield "give one of question, check and read"
+            yield "give one of question, check, read, experiment and unit_test"
+        elif self.experiment or self.unit_test:
+            if len(self.outcomes) != 2:
+                yield "outcomes", "a run passes or fails: it has two answers"
+            elif self.passed and self.passed not in self.outcomes:
+                yield "passed", f"is none of the answers, {' and '.join(self.outcomes)}"
+        else:
+            for key in ("passed", "moves"):
+                if getattr(self, key) not in ("", None):
+                    yield key, "belongs to an experiment or a unit test"
         yield from _shares(self, "risk", "sure")
         yield from _not_below_zero(self, "minutes")
         if len(set(self.outcomes)) != len(self.outcomes) or len(self.outcomes) < 2:
@@ -324,6 +412,17 @@ def _shares(entry: object, *keys: str) -> Iterator[tuple[str, str]]:
             side = "above 1" if value > 1 else "below 0"
             meant = f"; did you mean {value / 100:g}?" if _LEAST_PERCENT <= value <= 100 else ""
             yield key, f"{value:g} is {side}: expected a share from 0 to 1{meant}"
+
+
+def _delay(entry: LinkFile | LeadsToFile) -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with an interval of time."""
+    after_s = entry.after_s
+    if not after_s:
+        return
+    if len(after_s) != 2 or not 0 <= after_s[0] <= _MOST or not 0 <= after_s[1] <= _MOST:
+        yield "after_s", "expected two times from 0 on, in seconds: [0, 30]"
+    elif after_s[0] > after_s[1]:
+        yield "after_s", f"nothing is from {after_s[0]:g} to {after_s[1]:g}"
 
 
 def _not_below_zero(entry: object, *keys: str) -> Iterator[tuple[str, str]]:

@@ -12,6 +12,7 @@ from functools import cmp_to_key
 from typing import Any, TypeAlias
 
 from amberbox.core.contracts import Budget
+from amberbox.core.cycles import cyclic_groups
 from amberbox.diagnosis.prolog.builtins import TESTS
 from amberbox.diagnosis.prolog.compiler import FIXED, compile_clause
 from amberbox.diagnosis.prolog.machine import (
@@ -185,52 +186,6 @@ class DatalogRelation:
 
 def _key(row: Row, columns: Columns) -> Any:
     return row[columns[0]] if len(columns) == 1 else tuple(row[column] for column in columns)
-
-
-Graph = Mapping[Key, Iterable[Key]]
-
-
-def dependency_groups(graph: Graph) -> list[list[Key]]:
-    """Return groups of relations that depend on each other, after those that they need.
-
-    Uses Tarjan's algorithm, without recursion.
-    """
-    number: dict[Key, int] = {}
-    lowest: dict[Key, int] = {}
-    path: list[Key] = []
-    on_path: set[Key] = set()
-    found: list[list[Key]] = []
-    for start in graph:
-        if start in number:
-            continue
-        work = [(start, iter(list(graph[start])))]
-        number[start] = lowest[start] = len(number)
-        path.append(start)
-        on_path.add(start)
-        while work:
-            key, needed = work[-1]
-            for other in needed:
-                if other not in graph:
-                    continue
-                if other not in number:
-                    number[other] = lowest[other] = len(number)
-                    path.append(other)
-                    on_path.add(other)
-                    work.append((other, iter(list(graph[other]))))
-                    break
-                if other in on_path:
-                    lowest[key] = min(lowest[key], number[other])
-            else:
-                work.pop()
-                if work:
-                    above = work[-1][0]
-                    lowest[above] = min(lowest[above], lowest[key])
-                if lowest[key] == number[key]:
-                    group = path[path.index(key) :]
-                    del path[path.index(key) :]
-                    on_path.difference_update(group)
-                    found.append(group)
-    return found
 
 
 Relations = Mapping[Key, DatalogRelation]
@@ -437,7 +392,7 @@ class DeductiveDatabase:
         Raises NotDatalogError if something behind the query needs the general solver.
         """
         graph = self._graph(query)
-        groups = [group for group in dependency_groups(graph) if group != [query.key]]
+        groups = [group for group in cyclic_groups(graph) if group != [query.key]]
         for group in groups:
             self._refuse_loops(group, graph, query)
         return graph, groups

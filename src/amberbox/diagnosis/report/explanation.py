@@ -163,7 +163,8 @@ class NextStep:
     ``make_safe`` comes before all else; ``text`` begins with it, ``then`` is the rest. ``order``
     has all actions in their order. ``instances`` are the tests that are asked as one, where which
     instance it is has to be found; ``test`` is the first of them, to which ``answers`` belong.
-    ``about`` are the failure modes that may be there and that the test sees.
+    ``about`` are the failure modes that may be there and that the test sees. ``run`` is the name of
+    the experiment or unit test that the test is, ``kind`` the kind of the test.
     """
 
     text: str
@@ -179,6 +180,8 @@ class NextStep:
     order: tuple[ProposedAction, ...] = ()
     instances: tuple[TestInstance, ...] = ()
     about: tuple[str, ...] = ()
+    kind: str = ""
+    run: str = ""
 
 
 # How it is with a robot by its own diagnosis

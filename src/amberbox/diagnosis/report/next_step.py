@@ -29,6 +29,7 @@ from amberbox.diagnosis.report.wording import (
     merge_texts,
     same_tests,
     sort_modes,
+    test_text,
 )
 
 ALMOST_CERTAIN = CONFIDENCE_WORDS[0][0]
@@ -69,7 +70,7 @@ def step_of(
         )  # fmt: skip
     check, first = asked.check, "; and ".join(remedies)
     same_kind = same_tests(knowledge, diagnosis, check)
-    which = f"Which one is it? {merge_texts([one.text for one in same_kind])}"
+    which = f"Which one is it? {merge_texts([test_text(one) for one in same_kind])}"
     question = which if len(same_kind) > 1 else asked.text
     test = ProposedAction("test", question, check.id)
     repairs = tuple(ProposedAction("repair", remedy) for remedy in remedies)
@@ -89,6 +90,8 @@ def step_of(
         (*first_of_all, *((*repairs, test) if mends_first else (test, *repairs))),
         _instances(names, same_kind),
         tuple(sorted({fault for one in same_kind for fault in _seen_by(diagnosis, one)})),
+        check.kind,
+        check.run,
     )
 
 
@@ -201,8 +204,10 @@ def _candidate(
         check = check_named(knowledge, test)
     except UsageError:  # a test of another engine: nothing is known of what it would give
         return None
-    text = f"Find out whether this shows: {names.symptom(check.reads)}" if check.reads else ""
-    return CandidateTest(check, text or check.text, _answers(knowledge, names, diagnosis, check))
+    text = test_text(check)
+    if check.reads:
+        text = f"Find out whether this shows: {names.symptom(check.reads)}"
+    return CandidateTest(check, text, _answers(knowledge, names, diagnosis, check))
 
 
 def _without_test(

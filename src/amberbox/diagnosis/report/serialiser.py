@@ -48,6 +48,7 @@ def symptoms_json(symptoms: Sequence[Symptom], counted: Collection[str]) -> list
             "confirmed": maybe_time(symptom.confirmed_ns),
             "gone": maybe_time(symptom.gone_ns),
             "reason": symptom.reason,
+            "size": symptom.size,
             "source": symptom.source,
             "blocked_by": list(symptom.blocked_by),
             "counted": symptom.id in counted,
@@ -83,6 +84,7 @@ def _hypothesis(hypothesis: Hypothesis) -> dict[str, Any]:
         "ambiguity": list(hypothesis.ambiguity),
         "proof": hypothesis.proof,
         "criticality": hypothesis.criticality,
+        "follows": sorted(hypothesis.follows),
     }
 
 
@@ -106,6 +108,8 @@ def _test(test: Test) -> dict[str, Any]:
         "risk": test.risk,
         "gain_bits": test.gain_bits,
         "outcomes": dict(test.outcomes),
+        "run": test.run or None,
+        "moves": test.moves,
     }
 
 

@@ -28,6 +28,7 @@ from amberbox.diagnosis.report.wording import (
     delay_text,
     join_with_or,
     number_word,
+    run_command,
     sentence,
 )
 
@@ -85,10 +86,13 @@ SURE_ENOUGH = 0.8  # how probable an answer to a test must make a fault for its 
 NOT_FOLLOWING = "Seen; it does not follow from any fault that leads, and may be a false alarm:"
 
 
-def as_text(explanation: Explanation, *, details: bool = True) -> str:
-    """Write an explanation as text of at most 88 columns; without ``details`` for laymen."""
+def as_text(explanation: Explanation, *, details: bool = True, folder: str = "FOLDER") -> str:
+    """Write an explanation as text of at most 88 columns; without ``details`` for laymen.
+
+    ``folder`` is the robot folder in commands that it names.
+    """
     lines = [*_wrapped(_first_paragraph(explanation)), ""]
-    for title, body in _sections(explanation):
+    for title, body in _sections(explanation, folder):
         lines += [title, *body, ""]
     if details:
         lines += ["Details", *(_line(text, "  ") for text in explanation.details), ""]
@@ -105,7 +109,7 @@ def _first_paragraph(explanation: Explanation) -> str:
     return " ".join((explanation.headline, *members, use, next_step))
 
 
-def _sections(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
+def _sections(explanation: Explanation, folder: str) -> Iterator[tuple[str, list[str]]]:
     was = explanation.state == "healed"
     yield "What was broken" if was else "What is broken", list(_broken(explanation))
     if explanation.cleared:
@@ -117,7 +121,7 @@ def _sections(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
     yield "What speaks against it", list(_against(explanation))
     yield "What else it may be", list(_others(explanation.others))
     yield "Could the robot be used" if was else "Can the robot be used", list(_use(explanation))
-    yield "Do this next", list(_next(explanation.next))
+    yield "Do this next", list(_next(explanation.next, folder))
 
 
 def _broken(explanation: Explanation) -> Iterator[str]:
@@ -244,12 +248,14 @@ def _use(explanation: Explanation) -> Iterator[str]:
         yield from _paragraph(sentence(use.careful))
 
 
-def _next(step: NextStep) -> Iterator[str]:
+def _next(step: NextStep, folder: str) -> Iterator[str]:
     for action in step.make_safe:
         yield from _paragraph(f"First, make it safe: {action.text} (it may be: {action.why}).")
     yield from _paragraph(sentence(f"Then: {step.then}" if step.make_safe else step.text))
     if step.test:
         yield _line(_effort(step), "  ")
+        if step.run:
+            yield f"  To run it: {run_command(step.kind, step.run, folder)}"
         yield from _paragraph("What the answers would mean:")
     shown = set[str]()
     for branch in step.answers:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -12,7 +13,7 @@ from amberbox.core.types import Diagnosis, Hypothesis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.covering.observations import Check
 from amberbox.diagnosis.fmea.findings import text_of as finding_text
-from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.fmea.model import Fmea, FollowingMode
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.make_safe import CREDIBLE, mode_probabilities
 from amberbox.diagnosis.report.explanation import ExplainedFault, Possibility
@@ -139,6 +140,22 @@ def merge_by_kind(kinds: Sequence[tuple[str, ...]], texts: Sequence[str]) -> lis
     return [merge_texts(of) for of in found.values()]
 
 
+def test_text(check: Check) -> str:
+    """Return what to do for a test; of a run also how long it takes and whether the robot moves."""
+    if not check.run:
+        return check.text
+    facts = [duration(check.cost_s)] if check.cost_s else []
+    facts += ["the robot moves", "somebody has to stand by"] if check.moves else []
+    return f"{check.text.rstrip('.')} ({', '.join(facts)})" if facts else check.text
+
+
+def run_command(kind: str, run: str, folder: str) -> str:
+    """Return the command that runs an experiment or a unit test of a robot folder."""
+    if kind == "experiment":
+        return shlex.join(["amberbox", "experiment", "run", folder, run])
+    return shlex.join(["amberbox", "test", folder, "-k", run])
+
+
 def same_tests(knowledge: Knowledge, diagnosis: Diagnosis, check: Check) -> list[Check]:
     """Return a test together with the same test of other instances that may be broken.
 
@@ -243,8 +260,18 @@ class FaultNames:
         """Describe failure modes that are present together; none is a false alarm."""
         if not faults:
             return FALSE_ALARM
-        texts = [self.mode(fault) for fault in sort_modes(self.active(faults))]
-        return f"{join_with_and(texts)}{common_onset_text(len(texts))}"
+        active = set(self.active(faults))
+        follows = {one.mode for name in active for one in self._leads_to(name)} & active
+        texts = [self.mode(fault) for fault in sort_modes(active - follows)]
+        text = f"{join_with_and(texts)}{common_onset_text(len(texts))}"
+        if not follows:
+            return text
+        later = join_with_and([self.mode(fault) for fault in sort_modes(follows)])
+        return f"{text}, and from {'it' if len(texts) == 1 else 'one of them'} {later}"
+
+    def _leads_to(self, mode_id: str) -> Sequence[FollowingMode]:
+        mode = self.fmea.modes.get(mode_id)
+        return mode.leads_to if mode is not None else ()
 
     def active(self, faults: Collection[str]) -> Collection[str]:
         """Return those of some failure modes that show still; all if none does."""

@@ -1,0 +1,1 @@
+"""Consistency-based diagnosis: which modes of components agree with what was observed."""
