@@ -7,6 +7,7 @@ some verbs were written that way before. The client is imported only for an addr
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from amberbox.cli._output import print_notes
 from amberbox.client.address import is_url, with_robot
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.core.timestamps import ordered_span, parse_time
 from amberbox.server.archive.location import archive_in
@@ -193,18 +195,40 @@ def accept_relative_times(parser: argparse.ArgumentParser) -> None:
     parser._negative_number_matcher = re.compile(r"-\d")
 
 
-def add_range_only(parser: argparse.ArgumentParser) -> None:
-    """Add ``--from`` and ``--to``."""
+def add_seconds(parser: argparse.ArgumentParser, default: float) -> None:
+    """Add ``--seconds``, after which a search gives up (``budget_of``)."""
+    parser.add_argument(
+        "--seconds", type=float, default=default, metavar="S",
+        help=f"give up after S seconds (default {default:g})",
+    )  # fmt: skip
+
+
+def budget_of(args: argparse.Namespace, **limits: int) -> Budget:
+    """Return a budget that is over ``--seconds`` from now; raises UsageError for no number."""
+    if not 0.0 <= args.seconds < math.inf:
+        raise UsageError("--seconds must be a number, 0 or more")
+    began_s, seconds = time.monotonic(), float(args.seconds)
+
+    def is_past(share: float) -> bool:
+        return time.monotonic() >= began_s + share * seconds
+
+    return Budget(is_over=lambda: is_past(1.0), is_past=is_past, **limits)
+
+
+def add_range_only(parser: argparse.ArgumentParser, end: str = "--to") -> None:
+    """Add ``--from`` and ``--to``, or another option for the end of the range."""
     accept_relative_times(parser)
     times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
     parser.add_argument("--from", dest="from_", metavar="T", help=f"first time: {times}")
-    parser.add_argument("--to", metavar="T", help="end of the range, not included")
+    parser.add_argument(end, dest="to", metavar="T", help="end of the range, not included")
+    parser.set_defaults(end_option=end)
 
 
 def span_of(args: argparse.Namespace, record: Record) -> tuple[int | None, int | None]:
     """Return ``--from`` and ``--to`` (ns); raises UsageError that names the invalid option."""
+    end = getattr(args, "end_option", "--to")
     return ordered_span(
-        time_of("--from", args.from_, record.time_ns), time_of("--to", args.to, record.time_ns)
+        time_of("--from", args.from_, record.time_ns), time_of(end, args.to, record.time_ns)
     )
 
 

@@ -65,7 +65,7 @@ def detail(board: CurrentState, component: str, view: StatusView) -> Iterator[st
             which = "" if plan.needs is None else f" {plan.needs}"
             yield f"needs{which}: {', '.join(needs)}"
         if plan.recovery_actions:
-            yield f"recovery actions (not carried out): {', '.join(plan.recovery_actions)}"
+            yield f"recovery actions: {', '.join(plan.recovery_actions)}"
     yield from alarms_of(board, component, view)
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import getpass
 import json
+import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from amberbox.cli._arguments import add_actions
-from amberbox.cli._output import in_columns, print_json, print_lines
+from amberbox.cli._output import in_columns, print_json, print_lines, print_notes
 from amberbox.core.errors import AmberboxError, ConfigurationError, UsageError
 from amberbox.core.interrupt import Interrupt
 from amberbox.experiments.action import (
@@ -21,15 +22,17 @@ from amberbox.experiments.action import (
     announcement,
     check_parameters,
     load_action,
+    parameters_of_words,
     read_actions,
 )
+from amberbox.experiments.local import ActionAtWork
 
 _USAGE = (
     "amberbox action [list] FOLDER | run FOLDER NAME [PARAMETER=VALUE ...] [--simulated] [--yes] "
     "[--json]"
 )
 _RENEW_S = 0.5
-_YES_NO = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_LONG = 40  # characters of choices that are not broken into lines
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +90,9 @@ def action_rows(actions: Iterable[DeclaredAction]) -> list[Sequence[str]]:
 def limits_text(parameter: ParameterOptions) -> str:
     """Return the values that a parameter may have: ``-2 .. 2 m``."""
     if parameter.choices:
-        text = "|".join(map(str, parameter.choices))
+        choices = [str(choice) for choice in parameter.choices]
+        text = "|".join(choices)
+        text = text if len(text) <= _LONG else " | ".join(choices)
     elif parameter.kind in ("int", "float"):
         low, high = parameter.min, parameter.max
         text = f"{'' if low is None else f'{low:g}'} .. {'' if high is None else f'{high:g}'}"
@@ -97,29 +102,26 @@ def limits_text(parameter: ParameterOptions) -> str:
 
 
 def _run(args: argparse.Namespace, folder: Path) -> int:
-    from amberbox.agent.actor import Task  # few verbs need it
-    from amberbox.agent.actor_supervisor import SupervisedActor
-
     if not args.rest:
         raise UsageError("action run needs the NAME of an action", _USAGE)
     action = load_action(folder, args.rest[0])
-    text = _parameters(action, args.rest[1:])
+    text = json.dumps(parameters_of_words(action, args.rest[1:]))
     values = check_parameters(action, text)
-    if args.simulated and not action.has("simulated"):
-        raise UsageError(f"{action.name} has no simulated twin", "declare 'simulated:' for it")
     if action.options.risk == "moves" and not (args.yes or args.simulated):
-        _ask(action, values)
-    task = Task(str(folder.absolute()), action.name, text, simulated=args.simulated)
-    actor = SupervisedActor(task, lambda line: print(f"  {line}", file=sys.stderr, flush=True))
+        ask_before_moving(action.name, values)
+    port = ActionPort(folder, simulated=args.simulated)
+    run = port.begin(
+        action.name, text, None, lambda line: print(f"  {line}", file=sys.stderr, flush=True)
+    )
     interrupted = False
-    outcome = None
+    outcome: Any = None  # of either kind; the command process prints nothing here
     while outcome is None:
         try:
-            actor.renew()
-            outcome = actor.wait(_RENEW_S)
+            run.renew()
+            outcome = run.wait(_RENEW_S)
         except KeyboardInterrupt:  # the robot is stopped first, however often it is pressed
             interrupted = True
-            actor.abort("aborted with Ctrl-C")
+            run.abort("Ctrl-C")
     if args.json:
         print_json({
             "action": action.name, "state": outcome.state, "reason": outcome.reason,
@@ -136,37 +138,76 @@ def _run(args: argparse.Namespace, folder: Path) -> int:
     return Interrupt.STATUS if interrupted else 0
 
 
-def _parameters(action: DeclaredAction, words: Sequence[str]) -> str:
-    """Return words ``NAME=VALUE`` as a JSON object; values are judged with their limits later."""
-    found: dict[str, Any] = {}
-    for word in words:
-        name, is_given, value = word.partition("=")
-        if not is_given:
-            raise UsageError(f"'{word}' is no parameter", "write it as distance_m=0.5")
-        if name in found:
-            raise UsageError(f"'{name}' is given twice", _USAGE)
-        declared = action.parameters.get(name)
-        found[name] = value if declared is None else _value(declared.kind, value)
-    return json.dumps(found)
+class ActionPort:
+    """The actions of a robot folder, carried out here (``experiments.local.RobotPort``).
+
+    The command process carries them out where one runs, so that only one commands the robot.
+    """
+
+    def __init__(self, folder: Path, *, simulated: bool = False) -> None:
+        from amberbox.agent.command_socket import orders_at  # few verbs need it
+
+        self._folder, self._is_simulated = folder, simulated
+        self._store = None if simulated else orders_at(folder)
+        if not simulated and self._store is None:
+            print_notes(["no command process runs (amberbox run): nothing keeps others from "
+                         "commanding meanwhile, and the record has nothing of it"])  # fmt: skip
+
+    def begin(
+        self, action: str, parameters: str, timeout_s: float | None, report: Callable[[str], None]
+    ) -> ActionAtWork:
+        """Begin an action; raises AmberboxError if the robot does not take it."""
+        from amberbox.agent.actor import Task  # few verbs need them
+        from amberbox.agent.actor_supervisor import SupervisedActor
+        from amberbox.agent.command_socket import SiteOrder
+
+        declared = self._declared(action)
+        check_parameters(declared, parameters)
+        if self._is_simulated and not declared.has("simulated"):
+            raise UsageError(f"{action} has no simulated twin", "declare 'simulated:' for it")
+        if self._store is not None:
+            return SiteOrder(
+                self._store, action, parameters, who=_who(), confirmed=True, report=report
+            )
+        task = Task(
+            str(self._folder.absolute()), action, parameters, timeout_s,
+            simulated=self._is_simulated,
+        )  # fmt: skip
+        return SupervisedActor(task, report)
+
+    def timeout_s(self, action: str) -> float:
+        """Return the longest run of an action, which it declares."""
+        return self._declared(action).options.timeout
+
+    def moves(self, action: str) -> bool:
+        """Return whether an action moves the robot."""
+        return self._declared(action).options.risk == "moves"
+
+    def _declared(self, action: str) -> DeclaredAction:
+        """Return an action, or a unit test as one (``test.NAME``), as it is declared now."""
+        from amberbox.agent.unit_test_action import is_unit_test, load_unit_test
+        from amberbox.agent.unit_tests import collect
+
+        if not is_unit_test(action):
+            return load_action(self._folder, action)
+        collect(self._folder)
+        return load_unit_test(self._folder, action)
 
 
-def _value(kind: str, text: str) -> Any:
-    if kind == "bool":
-        return _YES_NO.get(text.lower(), text)
-    if kind != "string":
-        with contextlib.suppress(ValueError):
-            return int(text)
-        with contextlib.suppress(ValueError):
-            return float(text)
-    return text
+def _who() -> str:
+    """Return who is at the terminal, for the record."""
+    try:
+        return f"{os.environ.get('SUDO_USER') or getpass.getuser()} at the robot"
+    except (OSError, KeyError):  # a user without a name
+        return f"user {os.getuid()} at the robot"
 
 
-def _ask(action: DeclaredAction, values: dict[str, Any]) -> None:
+def ask_before_moving(name: str, values: dict[str, Any]) -> None:
     """Ask on the terminal whether the robot may move; raises UsageError if not."""
     if not sys.stdin.isatty():
-        raise UsageError(f"{action.name} moves the robot", "--yes says that nobody is in its way")
+        raise UsageError(f"{name} moves the robot", "--yes says that nobody is in its way")
     shown = " ".join(f"{name}={value}" for name, value in values.items())
-    question = f"{action.name} {shown}".rstrip() + " moves the robot. Is its way free? [y/N] "
+    question = f"{name} {shown}".rstrip() + " moves the robot. Is its way free? [y/N] "
     print(question, end="", flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("not confirmed: nothing was done")

@@ -1,4 +1,4 @@
-"""Alarms of a robot, from its record or its server: list them, acknowledge or shelve one."""
+"""Alarms of a robot, from its record or its server: list, acknowledge, shelve or resolve them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KIND = "alarm"  # kind of the requests to the watcher
 _WRITER = "watch"
 _USAGE = (
     "amberbox alarm [list] WHERE [--all] | ack WHERE ID | shelve WHERE ID --for 2h | "
-    "unshelve WHERE ID [--who NAME] [--note TEXT] [--json]"
+    "unshelve WHERE ID | resolve WHERE ID --note TEXT [--who NAME] [--note TEXT] [--json]"
 )
 _HEADER = ("id", "state", "level", "severity", "opened (UTC)", "times", "who", "reason")
 
@@ -42,7 +42,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     words = {name: () if name == "list" else ("ID",) for name in _ACTIONS}
     add_actions(parser, words, "list", place, where_first=True)
     add_robot(parser)
-    parser.add_argument("--all", action="store_true", help="list those that have healed, too")
+    parser.add_argument(
+        "--all", action="store_true", help="list those that are resolved or have healed, too"
+    )
     parser.add_argument("--for", dest="for_", metavar="TIME", help="how long it is shelved: 2h")
     parser.add_argument("--who", default="", metavar="NAME", help="who says so; else the user")
     parser.add_argument("--note", default="", metavar="TEXT", help="a word on why")
@@ -72,7 +74,8 @@ def newest(where: str) -> list[Row]:
 
 
 def _list(args: argparse.Namespace) -> None:
-    rows = [row for row in newest(args.where) if args.all or row["state"] != "healed"]
+    over = () if args.all else ("healed", "resolved")
+    rows = [row for row in newest(args.where) if row["state"] not in over]
     with_cause = any(row.get("cause", "") for row in rows)
     header = (*_HEADER, "cause") if with_cause else _HEADER
 
@@ -112,6 +115,12 @@ def _shelve(args: argparse.Namespace, alarm_id: str) -> None:
         raise UsageError(f"--for {args.for_} is too short", "--for 2h")
     outcome = f"shelved for {format_duration(duration_ns)}"
     _request(args, alarm_id, "shelve", outcome, time.time_ns() + duration_ns)
+
+
+def _resolve(args: argparse.Namespace, alarm_id: str) -> None:
+    if not args.note:
+        raise UsageError("an alarm is resolved for a reason", "--note 'a plug was loose'")
+    _request(args, alarm_id, "resolve", "resolved")
 
 
 def _request(
@@ -159,6 +168,7 @@ _ACTIONS: dict[str, Callable[..., None]] = {
     "ack": partial(_request, action="acknowledge", outcome="acknowledged"),
     "shelve": _shelve,
     "unshelve": partial(_request, action="unshelve", outcome="taken from the shelf"),
+    "resolve": _resolve,
 }
 
 
@@ -203,6 +213,10 @@ def _change(fleet: Fleet, alarm: AlarmLine, action: str, args: argparse.Namespac
         return fleet.acknowledge(alarm.id, alarm.revision, args.note).alarm
     if action == "unshelve":
         return fleet.unshelve(alarm.id, alarm.revision).alarm
+    if action == "resolve":
+        if not args.note:
+            raise UsageError("an alarm is resolved for a reason", "--note 'a plug was loose'")
+        return fleet.resolve(alarm.id, alarm.revision, args.note).alarm
     if args.for_ is None or not args.note:
         raise UsageError("an alarm is shelved for some time, and for a reason",
                          "--for 2h --note 'spare part'")  # fmt: skip

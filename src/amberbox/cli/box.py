@@ -1,4 +1,4 @@
-"""The box on its computer: run, link and examine it, join a server, install it as a service.
+"""The box on its computer: run and link it, join a server, install it as a service.
 
 Each verb imports what it needs: ``run`` and ``link`` stay for as long as the robot is on.
 """
@@ -14,9 +14,9 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,9 +27,9 @@ from amberbox.blackbox.store.store import create_store
 from amberbox.cli._output import print_json, print_lines, print_notes
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.files import keep_to_group, replace_file, sync_folder
+from amberbox.core.interrupt import called_by_signals
 
 if TYPE_CHECKING:
-    from amberbox.agent.doctor.subject import DoctorFinding
     from amberbox.agent.link import LinkProcess
     from amberbox.agent.supervisor import SupervisedBox
 
@@ -53,11 +53,9 @@ def run_run(args: argparse.Namespace) -> int:
     from amberbox.agent.supervisor import ProcessSupervisor
 
     supervisor = ProcessSupervisor(box_of(args.folder, quiet=args.quiet))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: supervisor.stop())
     hung_up = supervisor.stop if sys.stdin and sys.stdin.isatty() else supervisor.reload
-    signal.signal(signal.SIGHUP, lambda *_: hung_up())
-    supervisor.run()
+    with called_by_signals(supervisor.stop), called_by_signals(hung_up, [signal.SIGHUP]):
+        supervisor.run()
     return 0
 
 
@@ -124,6 +122,34 @@ async def _until_stopped(agent: LinkProcess) -> None:
 
 def _print_note(text: str) -> None:
     print_notes([text])
+
+
+_MIRROR_EXIT = "exit status: 0 after an orderly end, 2 wrong usage or configuration at the start"
+
+
+def configure_mirror(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("folder", metavar="FOLDER", help="robot folder whose robot.yaml has a "
+                        "block mongodb")  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="do not say when the database comes "
+                        "or goes")  # fmt: skip
+    parser.epilog = _MIRROR_EXIT
+
+
+def run_mirror(args: argparse.Namespace) -> int:
+    """Mirror until SIGTERM or Ctrl-C; what is recorded by then is copied first."""
+    keep_to_group()
+    if not Path(args.folder).is_dir():
+        raise UsageError(f"'{args.folder}' is no folder", "mirror takes a robot folder")
+    from amberbox.agent.mirror import MirrorProcess
+
+    folder = load_folder(args.folder)
+    log = (lambda text: None) if args.quiet else _print_note
+    process = MirrorProcess(folder, create_store(folder.store_path), log)
+    stop = threading.Event()
+    with called_by_signals(stop.set):
+        process.run(stop)
+    return 0
 
 
 _JOIN_EXIT = "exit status: 0 joined, 1 written down but the server cannot be reached now, 2 refused"
@@ -299,33 +325,3 @@ def _run_command(command: Sequence[str]) -> None:
     if done.returncode:
         errors = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
         raise AmberboxError(f"{shlex.join(command)}: {errors[-1]}", "journalctl -xe tells more")
-
-
-def configure_doctor(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's arguments."""
-    parser.add_argument("folder", metavar="FOLDER", help="robot folder, or its black_box.yaml")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def run_doctor(args: argparse.Namespace) -> int:
-    """Print findings with hints; return 1 if there is any error."""
-    from amberbox.agent.doctor.checkup import checkup
-
-    findings = checkup(args.folder)
-    if args.json:
-        print_json([asdict(finding) for finding in findings])
-    else:
-        print_lines(report(findings))
-    return 1 if any(finding.level == "error" for finding in findings) else 0
-
-
-def report(findings: Iterable[DoctorFinding]) -> Iterator[str]:
-    """Yield the findings as lines, hints below, then the counts by level."""
-    found = list(findings)
-    width = max((len(finding.check) for finding in found), default=0)
-    for finding in found:
-        yield f"{finding.level:<5}  {finding.check:<{width}}  {finding.found}"
-        if finding.hint:
-            yield f"{'':<7}{'':<{width}}  hint: {finding.hint}"
-    levels = Counter(finding.level for finding in found)
-    yield ", ".join(f"{levels[level]} {level}" for level in ("ok", "warn", "error"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import threading
 import time
@@ -25,6 +24,7 @@ from amberbox.blackbox.store.store import WriterLock, create_store
 from amberbox.cli._output import print_lines, print_notes
 from amberbox.core.errors import UsageError
 from amberbox.core.files import keep_to_group
+from amberbox.core.interrupt import called_by_signals
 from amberbox.core.safe_text import one_line
 
 _WATCH_S = 0.3
@@ -51,10 +51,9 @@ def run_act(args: argparse.Namespace) -> int:
     store = create_store(folder.store_path)
     lock = WriterLock(store, WRITER)
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
     try:
-        CommandProcess(folder, store, log=_nothing if args.quiet else _note).run(stop)
+        with called_by_signals(stop.set):
+            CommandProcess(folder, store, log=_nothing if args.quiet else _note).run(stop)
     finally:
         lock.release()
     return 0

@@ -16,13 +16,15 @@ from typing import Any
 
 import msgspec
 
+from amberbox.agent.recovery import read_recovery, recovery_lines
+from amberbox.agent.recovery_actions import command_lines, recovery_actions
 from amberbox.blackbox.journal import channels
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.record import open as open_record
 from amberbox.blackbox.query.record_window import RecordWindow
 from amberbox.blackbox.robot_folder.folder import RobotFolder, load_folder, store_of
 from amberbox.blackbox.store.own_records import OwnRecords, newest_records
-from amberbox.blackbox.store.store import Store, is_locked, is_store, open_store
+from amberbox.blackbox.store.store import Store, is_locked, is_store, open_store, submit
 from amberbox.cli._arguments import (
     accept_relative_times,
     add_where,
@@ -30,6 +32,7 @@ from amberbox.cli._arguments import (
     refuse_options,
     robot_at,
     time_of,
+    user_name,
 )
 from amberbox.cli._output import print_json, print_lines, print_notes, text_output
 from amberbox.client.address import is_url
@@ -40,6 +43,7 @@ from amberbox.core.clock import NS
 from amberbox.core.config import raise_errors
 from amberbox.core.contracts import GivenEvidence
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.given_answers import RecordedAnswer
 from amberbox.core.timestamps import format_time, parse_duration
 from amberbox.core.types import Diagnosis, Symptom
 from amberbox.diagnosis.diagnose import (
@@ -53,6 +57,7 @@ from amberbox.diagnosis.diagnose import (
     load_engine,
     observe,
 )
+from amberbox.diagnosis.evidence.user import parse_answers
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.report.explain import explain
 from amberbox.diagnosis.report.explanation import (
@@ -65,6 +70,7 @@ from amberbox.diagnosis.report.serialiser import context_json, explain_context
 from amberbox.diagnosis.report.svg import as_svg
 from amberbox.diagnosis.report.text import as_text
 from amberbox.diagnosis.report.wording import WORTH_SHOWING, date_and_clock, sentence
+from amberbox.experiments.action import read_actions
 from amberbox.monitoring.current_state import (
     CHANNELS,
     WRITER,
@@ -75,10 +81,11 @@ from amberbox.monitoring.current_state import (
 )
 from amberbox.monitoring.plan import MonitoringPlan
 from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.watcher import ANSWER_KIND
 
 _USAGE = (
     "amberbox diagnose WHERE [--at T] [--symptom ID[=absent|unknown]]... [--answer TEST=VALUE]... "
-    "[--engine covering|rules|faulttree] [--follow] [--json] [--svg FILE]"
+    "[--record [--who NAME]] [--engine covering|rules|faulttree] [--follow] [--json] [--svg FILE]"
 )
 _LOOKBACK = "10m"
 _LATE_NS = 3 * NS
@@ -97,6 +104,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="take a symptom for present, or for absent or unknown")  # fmt: skip
     parser.add_argument("--answer", action="append", default=[], metavar="TEST=VALUE",
                         help="what a test gave; 'cannot' if it cannot be done")  # fmt: skip
+    parser.add_argument("--record", action="store_true", help="tell the robot the answers: its "
+                        "diagnosis counts them from now on, and its server has them")  # fmt: skip
+    parser.add_argument("--who", default="", metavar="NAME", help="who answers; else the user")
     parser.add_argument("--engine", choices=engine_names(), default=COVERING,
                         help="who answers: all together (covering), or one alone")  # fmt: skip
     parser.add_argument("--lookback", default=_LOOKBACK, metavar="TIME", help="evaluate so much of "
@@ -117,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--follow shows what the watcher finds", "leave out the other options")
     if args.json and args.svg == "-":
         raise UsageError("--json and --svg - both print", "--svg FILE")
+    if args.record and (not args.answer or args.at or args.symptom or args.follow):
+        raise UsageError("--record takes the answers to tests of now", "--answer TEST=VALUE")
     if parse_duration(args.lookback) <= 0:
         raise UsageError(f"--lookback {args.lookback} is too short", f"--lookback {_LOOKBACK}")
     if is_url(args.where):
@@ -133,8 +145,32 @@ def run(args: argparse.Namespace) -> int:
         if args.follow:
             return _follow(args, subject, record)
         case = _case(args, subject, record)
+        if args.record:
+            return _record_answers(args, subject, case, record)
         case, diagnosis = _diagnosed(args, subject, case, record)
     return _show(args, subject, case, diagnosis)
+
+
+def _record_answers(
+    args: argparse.Namespace, subject: DiagnosedFolder, case: DiagnosisContext,
+    record: Record | None,
+) -> int:  # fmt: skip
+    """Leave the answers to the open diagnosis for the watcher, which writes them down."""
+    if record is None or case.open is None or case.origin != "watcher":
+        raise UsageError(
+            f"no watcher has an open diagnosis of {args.where}",
+            f"amberbox diagnose {args.where} shows what is known",
+        )
+    store, diagnosis = open_store(record.path), case.open.id
+    for test, value in parse_answers(args.answer, subject.knowledge).items():
+        given = RecordedAnswer(diagnosis, test, value, args.who or user_name())
+        submit(store, ANSWER_KIND, msgspec.to_builtins(given))
+    later = "" if is_locked(store, WRITER) else " as soon as amberbox watch runs on this store"
+    if args.json:
+        print_json({"diagnosis": diagnosis, "answers": dict(map(_answer_given, args.answer))})
+    else:
+        print_lines([f"the next revision of {diagnosis} will count it{later}"])
+    return 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +230,8 @@ def _read(args: argparse.Namespace, subject: DiagnosedFolder, record: Record) ->
     if at_ns is None:
         return DiagnosisContext(time.time_ns())  # a record without rows
     lookback_s = parse_duration(args.lookback) / NS
-    case = context_at(knowledge, subject.plan, store, at_ns, lookback_s)
+    folder = subject.folder.path
+    case = context_at(knowledge, subject.plan, store, at_ns, lookback_s, folder)
     if at_ns - case.at_ns > _LATE_NS:
         print_notes(
             [f"nothing was recorded after {format_time(case.at_ns)[:19]}; this is as of then"]
@@ -268,8 +305,24 @@ def _show(
         ended_ns = None
         if diagnosis is not None and diagnosis.state == "healed":
             ended_ns = case.at_ns - diagnosis.at_ns
-        print_lines([text_of(args.engine, explanation, ended_ns, nothing)])
+        place = str(subject.folder.path)
+        print_lines([text_of(args.engine, explanation, ended_ns, nothing, place)])
+        print_lines(_recovery_lines(subject, explanation))
     return int(is_fault_indicated(case, diagnosis))
+
+
+def _recovery_lines(subject: DiagnosedFolder, explanation: Explanation | None) -> Iterator[str]:
+    """Yield the commands that may help against the leading failure modes, and what rules do."""
+    folder = subject.folder
+    broken = explanation.broken if explanation is not None else None
+    faults = [f.id for one in broken.members for f in one.faults] if broken is not None else []
+    actions = read_actions(folder.path)[0]
+    found = recovery_actions(subject.plan, subject.knowledge.fmea, actions)
+    lines = [*command_lines(found, faults, str(folder.path))]
+    if is_store(folder.store_path):
+        lines += recovery_lines(read_recovery(open_store(folder.store_path)))
+    if lines:
+        yield from ("", "What the robot can do about it", *(f"  {line}" for line in lines))
 
 
 def _draw(path: str, explanation: Explanation | None) -> None:
@@ -314,17 +367,19 @@ def revisions(
 
 
 def text_of(
-    engine: str, explanation: Explanation | None, ended_ns: int | None, nothing: str
-) -> str:
+    engine: str, explanation: Explanation | None, ended_ns: int | None, nothing: str,
+    folder: str = "FOLDER",
+) -> str:  # fmt: skip
     """Return the explanation as text, or that nothing is wrong; a single engine is named on top.
 
-    ``ended_ns`` is how long ago (ns) the last diagnosis ended, None for an open one.
+    ``ended_ns`` is how long ago (ns) the last diagnosis ended, None for an open one. ``folder`` is
+    the robot folder in commands.
     """
     alone = load_engine(engine)
     if explanation is None:
         text = (alone.NOTHING if alone is not None else "") or nothing
     else:
-        text = as_text(explanation).rstrip("\n")
+        text = as_text(explanation, folder=folder).rstrip("\n")
         if ended_ns is not None:
             ended = f"the last diagnosis ended {duration_text(ended_ns)} ago:"
             text = f"nothing is wrong now; {ended}\n\n{text}"
@@ -449,7 +504,8 @@ _SYMPTOM_STATES = ("present", "absent", "unknown")
 
 def _run_on_server(args: argparse.Namespace) -> int:
     """Show a server's diagnosis; return 0 without a fault, 1 with one."""
-    given = {"follow": args.follow, "folder": args.folder, "lookback": args.lookback != _LOOKBACK}
+    given = {"follow": args.follow, "folder": args.folder, "lookback": args.lookback != _LOOKBACK,
+             "record": args.record, "who": args.who}  # fmt: skip
     refuse_options(args.where, given, "the server has the robot's folder, and looks itself; "
                    "amberbox status URL --watch shows what changes")  # fmt: skip
     check_time("--at", args.at)

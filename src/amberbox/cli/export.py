@@ -325,7 +325,7 @@ def _refuse_incomplete(record: RemoteRecord, args: argparse.Namespace, span: Tim
 def configure_import(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT",
-                        help="ROS bag, MCAP, ULog or CSV file, mongodump folder")  # fmt: skip
+                        help="ROS bag, MCAP, ULog, CSV, CAN log, pcap, mongodump")  # fmt: skip
     parser.add_argument("--store", required=True, type=Path, metavar="DIR",
                         help="store or robot folder; made if it is not there")  # fmt: skip
     parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC",
@@ -336,7 +336,13 @@ def configure_import(parser: argparse.ArgumentParser) -> None:
                         help="folder of .msg files for the types of mongodump folders")  # fmt: skip
     parser.add_argument("--time", metavar="COLUMN", help="time column of CSV files")
     parser.add_argument("--start", metavar="TIME",
-                        help="when CSV and ULog files begin whose times are no dates")  # fmt: skip
+                        help="when files begin whose times are no dates")  # fmt: skip
+    parser.add_argument("--dbc", nargs="+", type=Path, default=[], metavar="FILE",
+                        help="DBC files that describe the messages of CAN logs")  # fmt: skip
+    parser.add_argument("--eds", nargs="+", default=[], metavar="NODE=FILE",
+                        help="EDS or DCF files of the CANopen nodes in CAN logs")  # fmt: skip
+    parser.add_argument("--ethercat", type=Path, metavar="FILE",
+                        help="black_box.yaml that describes captures of EtherCAT")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
@@ -351,7 +357,9 @@ def run_import(args: argparse.Namespace) -> int:
         topics=[TopicOptions(name) for name in args.topics],
         source=args.source,
         progress=progress,
-        options=ReadOptions(args.msg, args.time, _start_ns(args.start)),
+        options=ReadOptions(
+            args.msg, args.time, _start_ns(args.start), args.dbc, args.eds, args.ethercat
+        ),
     )
     if args.json:
         print(json.dumps([_import_json(report) for report in reports], indent=2))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amberbox.cli._arguments import (
     accept_any_order,
     accept_relative_times,
+    add_seconds,
     add_where,
+    budget_of,
     check_time,
     opened,
     refuse_options,
@@ -25,13 +27,21 @@ from amberbox.client.address import is_url
 from amberbox.core.config import raise_errors
 from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
+from amberbox.core.names import component_id
 from amberbox.core.timestamps import format_time
-from amberbox.diagnosis.faulttree.analysis import Analysis, Importance, NearCutSet, analyse
+from amberbox.diagnosis.faulttree.analysis import (
+    Analysis,
+    Importance,
+    NearCutSet,
+    analyse,
+    most_probable,
+)
 from amberbox.diagnosis.faulttree.decision_diagrams import MOST_NODES
 from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
 from amberbox.diagnosis.faulttree.tree import DEFAULT_MISSION_TIME_H, FaultTree
 from amberbox.diagnosis.fmea.fault_trees import (
     FACTORS,
+    LISTED,
     EffectOutlook,
     analysis_json,
     closest_json,
@@ -43,6 +53,7 @@ from amberbox.diagnosis.fmea.fault_trees import (
     smallest_cut_sets,
 )
 from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.models import trees_of
 
 if TYPE_CHECKING:
     from amberbox.blackbox.robot_folder.folder import RobotFolder
@@ -50,7 +61,7 @@ if TYPE_CHECKING:
     from amberbox.diagnosis.diagnose import DiagnosisContext
 
 
-_SECONDS = 300.0
+_SECONDS = 15.0
 _EFFECT_HEADER = ("effect", "probability", "cut sets", "of order", "smallest", "what is lost")
 
 
@@ -70,6 +81,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--order", type=int, metavar="N", help="only cut sets of up to N events")
     parser.add_argument("--importance", action="store_true", help="what matters most, by event")
     parser.add_argument("--cut-sets", type=int, metavar="N", help="list the N smallest cut sets")
+    parser.add_argument(
+        "--most-probable", type=int, metavar="N",
+        help="list the N most probable cut sets and their share of the probability",
+    )  # fmt: skip
     parser.add_argument("--export", metavar="FILE", help="write the tree as Open-PSA MEF")
     parser.add_argument(
         "--exposure", type=float, metavar="H",
@@ -84,13 +99,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--mission-time", type=float, default=DEFAULT_MISSION_TIME_H, metavar="H",
         help="hours, for expressions of a file that use it (default: a year)",
     )  # fmt: skip
-    parser.add_argument(
-        "--seconds", type=float, default=_SECONDS, metavar="S",
-        help=f"give up after S seconds (default {_SECONDS:g})",
-    )  # fmt: skip
+    add_seconds(parser, _SECONDS)
     parser.add_argument(
         "--nodes", type=int, default=MOST_NODES, metavar="N",
-        help="give up at N nodes, about 200 bytes each (default %(default)s)",
+        help="give up at N nodes, up to 300 bytes each (default %(default)s)",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="one object")
 
@@ -98,10 +110,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve and show; return 1 when a budget ended before completion."""
     _check(args)
+    budget = budget_of(args, nodes=args.nodes)
     if is_url(args.where):
         return _run_on_server(args)
-    ends = time.monotonic() + args.seconds
-    budget = Budget(args.nodes, lambda: time.monotonic() > ends)
     if _is_tree(args.where):
         files = [args.where, *args.more]
         return _one(read_mef(files, args.effect, args.mission_time), args, budget)
@@ -110,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
         show_closest(fmea, args, budget)
         return 0
     if args.effect:
-        return _one(fault_tree_of(fmea, args.effect, args.exposure), args, budget)
+        return _one(_tree_of(fmea, args.effect, args), args, budget)
     if show_all(fmea, args, budget):
         return 0
     print_notes(["incomplete: --seconds and --nodes allow more"])
@@ -128,7 +139,8 @@ def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
             file.write(write_mef(tree))
     analysis = analyse(tree, args.order, args.importance, budget)
     if args.json:
-        made = analysis_json(analysis, args.importance, args.cut_sets or 0)
+        asked = args.importance, args.cut_sets or 0, args.most_probable or 0
+        made = analysis_json(analysis, *asked)
         files = {"files": [args.where, *args.more]} if args.more else {}
         print_json({"file": args.where, **files, **made})
     else:
@@ -140,11 +152,11 @@ def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    for name, least in (("order", 0), ("cut_sets", 1), ("nodes", 1)):
+    for name, least in (("order", 0), ("cut_sets", 1), ("most_probable", 1), ("nodes", 1)):
         given = getattr(args, name)
         if given is not None and given < least:
             raise UsageError(f"--{name.replace('_', '-')} must be {least} or more")
-    for name in ("seconds", "mission_time", "exposure"):
+    for name in ("mission_time", "exposure"):
         given = getattr(args, name)
         if given is not None and not 0.0 <= given < math.inf:
             raise UsageError(f"--{name.replace('_', '-')} must be a number, 0 or more")
@@ -191,7 +203,12 @@ def show(analysis: Analysis, args: argparse.Namespace) -> None:
             print(f"  min cut upper bound: {upper:.10g} ({kind})")
         if total is not None:
             print(f"  rare-event sum: {total:.10g} ({kind})")
+    elif analysis.bounds is not None:
+        lower, upper = analysis.bounds.lower, analysis.bounds.upper
+        print(f"probability: between {lower:.10g} and {upper:.10g}")
     _show_cut_sets(analysis, args.cut_sets or 0)
+    if args.most_probable or analysis.probable is not None:
+        _show_most_probable(analysis, args.most_probable or LISTED)
     if analysis.importance:
         print()
         rows = [_importance_row(tree, event, entry) for event, entry in analysis.importance.items()]
@@ -207,6 +224,25 @@ def _show_cut_sets(analysis: Analysis, count: int) -> None:
             print(f"  order {order}: {number:,}")
     for entry in smallest_cut_sets(analysis, count):
         print_lines(["  {" + ", ".join(called(analysis.tree, e) for e in sorted(entry)) + "}"])
+
+
+def _show_most_probable(analysis: Analysis, count: int) -> None:
+    found = most_probable(analysis, count)
+    if found is None:
+        return
+    kind = "smallest" if found.probabilities is None else "most probable"
+    share = ""
+    if found.share is not None:
+        low, high = (f"{100 * part:.3g} %" for part in found.share)
+        share = f", {low if low == high else f'{low} to {high}'} of the probability"
+    sure = ""
+    if found.certain < len(found.sets):
+        sure = f"; of the first {found.certain} it is sure that no other one is more probable"
+    print(f"{kind} minimal cut sets: {len(found.sets):,}{share}{sure}")
+    for place, events in enumerate(found.sets):
+        named = ", ".join(called(analysis.tree, event) for event in sorted(events))
+        chance = f"{found.probabilities[place]:.4g}  " if found.probabilities else ""
+        print_lines([f"  {chance}{{{named}}}"])
 
 
 def limit_note(limit: int | None) -> str:
@@ -235,13 +271,32 @@ def fmea_of(where: str) -> Fmea:
 
 def analysed(fmea: Fmea, effect: str, args: argparse.Namespace, budget: Budget) -> Analysis:
     """Solve the fault tree of one effect."""
-    tree = fault_tree_of(fmea, effect, args.exposure)
-    return analyse(tree, args.order, args.importance, budget)
+    return analyse(_tree_of(fmea, effect, args), args.order, args.importance, budget)
+
+
+def _tree_of(fmea: Fmea, effect: str, args: argparse.Namespace) -> FaultTree:
+    """Return the tree of an effect, or that of a gate in the robot folder's files."""
+    trees, needs = _folder_trees(args.where), fmea.needs()
+    if trees:
+        hint = f"effects on the system: {', '.join((*effects(fmea), *trees))}"
+        effect = component_id(effect, [*needs, *trees], kind="effect", hint=hint)
+    if effect in trees and effect not in needs:
+        return trees[effect]
+    return fault_tree_of(fmea, effect, args.exposure)
+
+
+@lru_cache(maxsize=1)
+def _folder_trees(where: str) -> Mapping[str, FaultTree]:
+    return trees_of(Path(where)) if Path(where).is_dir() else {}
 
 
 def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
     """Show all effects on the system; return whether all were completed."""
-    found = [analysed(fmea, effect, args, budget) for effect in effects(fmea)]
+    names = list(dict.fromkeys((*effects(fmea), *_folder_trees(args.where))))
+    found = [
+        analysed(fmea, effect, args, budget.turn(len(names) - place))
+        for place, effect in enumerate(names, 1)
+    ]
     if not found:
         print_notes(
             [f"{args.where} has no functions that could be lost; --effect takes components, too"]
@@ -255,8 +310,8 @@ def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
             show(analysis, args)
     else:
         rows = [
-            _effect_row(one.tree.top, one.top_probability, one.by_order, one.minimal_cut_sets,
-                        description(fmea, one)["description"])
+            _effect_row(one.tree.top, one.top_probability, _between(one), one.by_order,
+                        one.minimal_cut_sets, description(fmea, one)["description"])
             for one in found
         ]  # fmt: skip
         print_grid(_EFFECT_HEADER, rows)
@@ -265,12 +320,19 @@ def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
     return not any(analysis.incomplete for analysis in found)
 
 
+def _between(analysis: Analysis) -> tuple[float, float] | None:
+    bounds = analysis.bounds
+    return None if bounds is None else (bounds.lower, bounds.upper)
+
+
 def _effect_row(
-    effect: str, chance: float | None, by_order: Sequence[int] | None, number: int | None,
-    what: str,
+    effect: str, chance: float | None, between: Sequence[float] | None,
+    by_order: Sequence[int] | None, number: int | None, what: str,
 ) -> list[str]:  # fmt: skip
     """Return the row of an effect: probability, count of cut sets, and what its loss means."""
     first = [effect, "-" if chance is None else f"{chance:.3g}"]
+    if chance is None and between is not None:
+        first[1] = " to ".join(f"{value:.3g}" for value in between)
     if by_order is None:
         return [*first, "-", "-", "-", what]
     counts = {order: count for order, count in enumerate(by_order) if count}
@@ -331,7 +393,7 @@ def _context_at(folder: RobotFolder, at_ns: int, exposure_h: float | None) -> Di
     knowledge, _ = load_knowledge(folder, plan, exposure_h)
     assert knowledge is not None, "the failure modes have been read before"
     store = open_store(folder.store_path)
-    return context_at(knowledge, plan, store, at_ns, _LOOKBACK_S)
+    return context_at(knowledge, plan, store, at_ns, _LOOKBACK_S, folder.path)
 
 
 def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:
@@ -370,7 +432,7 @@ def _run_on_server(args: argparse.Namespace) -> int:
     with fleet:
         found = fleet.faulttrees(
             robot, args.effect, cut_sets=args.cut_sets or 0, order=args.order, at=args.at,
-            exposure_h=args.exposure,
+            exposure_h=args.exposure, most_probable=args.most_probable or 0,
         )  # fmt: skip
     print_notes(found["notes"])
     if args.json:
@@ -380,7 +442,8 @@ def _run_on_server(args: argparse.Namespace) -> int:
     elif args.effect:
         print("\n".join(_server_tree_lines(found, importance=args.importance)))
     else:
-        columns = ("effect", "top_probability", "by_order", "minimal_cut_sets", "description")
+        columns = ("effect", "top_probability", "probability_bounds", "by_order",
+                   "minimal_cut_sets", "description")  # fmt: skip
         rows = [_effect_row(*(one[name] for name in columns)) for one in found["effects"]]
         print_grid(_EFFECT_HEADER, rows)
     if found.get("incomplete"):
@@ -394,16 +457,33 @@ def _server_tree_lines(found: Mapping[str, Any], *, importance: bool) -> Iterato
     yield f"{found['effect']} ({found['description']}): {size}"
     if found["top_probability"] is not None:
         yield f"probability: {found['top_probability']:.10g} (exact)"
+    elif found.get("probability_bounds"):
+        lower, upper = found["probability_bounds"]
+        yield f"probability: between {lower:.10g} and {upper:.10g}"
     if found["by_order"] is not None:
         yield f"minimal cut sets: {found['minimal_cut_sets']:,}"
         counts = enumerate(found["by_order"])
         yield from (f"  order {order}: {count:,}" for order, count in counts if count)
     yield from ("  {" + ", ".join(entry) + "}" for entry in found.get("cut_sets", ()))
+    yield from _probable_lines(found.get("most_probable"))
     if importance and found["importance"]:
         yield ""
         for event, factors in found["importance"].items():
             values = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
             yield f"{event}: {', '.join(values)}"
+
+
+def _probable_lines(best: Mapping[str, Any] | None) -> Iterator[str]:
+    if best is None:
+        return
+    share = ""
+    if best["share"] is not None:
+        low, high = best["share"]
+        share = f", {100 * low:.3g} % to {100 * high:.3g} % of the probability"
+    yield f"most probable minimal cut sets: {len(best['cut_sets']):,}{share}"
+    for entry in best["cut_sets"]:
+        chance = "" if entry["probability"] is None else f"{entry['probability']:.4g}  "
+        yield f"  {chance}{{{', '.join(entry['events'])}}}"
 
 
 def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]:

@@ -1,14 +1,27 @@
-"""Failure modes of a robot or a server: check the FMEA; show sheet, criticality and coverage."""
+"""Failure modes of a robot or a server: check the FMEA; show sheet, criticality and coverage; learn
+numbers from repairs.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import difflib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.robot_folder.folder import inspect_folder
-from amberbox.cli._arguments import accept_where_first, add_where, refuse_options, robot_at
+from amberbox.blackbox.query.record import LocalRecord, Record
+from amberbox.blackbox.robot_folder.folder import inspect_folder, load_folder
+from amberbox.cli._arguments import (
+    PAGE,
+    accept_relative_times,
+    accept_where_first,
+    add_where,
+    opened,
+    refuse_options,
+    robot_at,
+    time_of,
+)
 from amberbox.cli._output import (
     print_grid,
     print_json,
@@ -17,10 +30,26 @@ from amberbox.cli._output import (
     writable,
 )
 from amberbox.client.address import is_url
-from amberbox.consult.folder_knowledge import fmea_references
+from amberbox.consult.folder_knowledge import fmea_references, load_knowledge
+from amberbox.consult.repairs import (
+    KnownSituations,
+    evaluated_faults,
+    read_situations,
+    recorded_faults,
+    was_found,
+    with_known_modes,
+)
 from amberbox.core.config import raise_errors
-from amberbox.core.errors import ConfigurationError, Problem, UsageError, did_you_mean
+from amberbox.core.errors import (
+    AmberboxError,
+    ConfigurationError,
+    Problem,
+    UsageError,
+    did_you_mean,
+)
+from amberbox.core.files import replace_file
 from amberbox.core.redaction import masked_values
+from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.diagnosis.fmea.criticality import (
     AmbiguousModes,
     PriorityRule,
@@ -32,8 +61,11 @@ from amberbox.diagnosis.fmea.criticality import (
     mode_criticality,
     priority,
 )
-from amberbox.diagnosis.fmea.loader import FILE, load_fmea
+from amberbox.diagnosis.fmea.edits import edited
+from amberbox.diagnosis.fmea.learning import WEIGHT, Proposal, learn
+from amberbox.diagnosis.fmea.loader import FILE, load_fmea, read_fmea
 from amberbox.diagnosis.fmea.model import FailureMode, Fmea, FmeaReferences
+from amberbox.diagnosis.fmea.parser import read
 from amberbox.diagnosis.fmea.sheet import (
     coverage_json,
     criticality_json,
@@ -41,10 +73,15 @@ from amberbox.diagnosis.fmea.sheet import (
     row_of,
     write_sheet,
 )
+from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.server.archive.location import archive_in
 
 _USAGE = (
     "amberbox fmea check|table|criticality|coverage WHERE [--json] [--csv FILE] "
-    "[--import FILE.csv] [--priorities FILE.csv] [--exposure HOURS]"
+    "[--import FILE.csv] [--priorities FILE.csv] [--exposure HOURS], "
+    "learn WHERE [RECORD...] [--apply] [--replay] [--from T] [--to T] [--weight N]"
 )
 _NOT_COMPARED = "symptoms are not compared with monitors"
 _SHOWN = ("Item", "Failure mode", "Severity", "S", "O", "D", "RPN", "Detection", "Action")
@@ -55,6 +92,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = _USAGE
     parser.add_argument("action", metavar="ACTION", help=", ".join(_ACTIONS))
     add_where(parser, f"robot folder, or a {FILE}")
+    parser.add_argument(
+        "records", nargs="*", metavar="RECORD",
+        help=f"learn: robot folders, stores, archives, or {PAGE}; without any, that of WHERE",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--csv", metavar="FILE", help="write the sheet to a file (- prints it)")
     parser.add_argument(
@@ -62,8 +103,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--priorities", metavar="FILE", help="table of S, O, D and priorities")
     parser.add_argument(
-        "--exposure", type=float, metavar="HOURS", help="time in which failures come about"
+        "--exposure",
+        type=float,
+        metavar="HOURS",
+        help="time in which failures come about; "
+        "learn: hours of operation, where the records hold only a part",
     )
+    parser.add_argument("--apply", action="store_true", help=f"learn: write it into {FILE}")
+    parser.add_argument(
+        "--replay", action="store_true", help="learn: evaluate records that were watched, too"
+    )
+    parser.add_argument("--from", dest="from_", metavar="T", help="learn: from this time on")
+    parser.add_argument("--to", metavar="T", help="learn: up to this time, not included")
+    parser.add_argument(
+        "--weight", type=float, default=WEIGHT, metavar="N",
+        help=f"learn: a 'detects' of the file counts as so many repairs [{WEIGHT:g}]",
+    )  # fmt: skip
+    accept_relative_times(parser)
     accept_where_first(parser, _ACTIONS)
 
 
@@ -74,6 +130,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"there is no action '{args.action}'{near}", _USAGE)
     if args.exposure is not None and not args.exposure >= 0:
         raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
+    if args.action == "learn":
+        return _learn(args)
+    _refuse_options_of_learn(args)
     if is_url(args.where):
         _run_on_server(args)
         return 0
@@ -255,7 +314,143 @@ def _similar_line(group: AmbiguousModes) -> str:
     return f"{', '.join(group.modes)}: {tests}{rest}"
 
 
+def _refuse_options_of_learn(args: argparse.Namespace) -> None:
+    given = {"RECORD": args.records, "--apply": args.apply, "--from": args.from_, "--to": args.to,
+             "--replay": args.replay}  # fmt: skip
+    strange = [name for name, value in given.items() if value]
+    if strange:
+        raise UsageError(f"fmea {args.action} takes no {', '.join(strange)}", _USAGE)
+
+
+def _learn(args: argparse.Namespace) -> int:
+    """Print what repairs say of the numbers of the file, and the change as a diff; or apply it."""
+    if not 0 < args.weight < 1e6:
+        raise UsageError(f"a weight of {args.weight:g} cannot be", "give a number of repairs")
+    if is_url(args.where):
+        what = f"'fmea learn' changes a {FILE} on this computer"
+        raise UsageError(what, f"amberbox fmea learn FOLDER {args.where}")
+    path = fmea_path(args.where)
+    fmea, known, problems = loaded(path)
+    raise_errors(problems)
+    assert fmea is not None
+    situations = _situations(args, fmea)
+    text, mark = _text_of(path)
+    root = parse_yaml(text, str(path), [])
+    assert root is not None
+    sheet = read(root, known, [])
+    hours = situations.hours if args.exposure is None else args.exposure
+    found = learn(sheet, fmea, situations.situations, hours, known, args.weight)
+    new, by_hand = edited(text, root, found)
+    if any(problem.is_error for problem in read_fmea(new, known, str(path))[1]):
+        what = f"the proposals cannot be written into {path} as it is laid out"
+        raise AmberboxError(what, "take the numbers by hand: amberbox fmea learn ... --json")
+    name = str(path)
+    lines = difflib.unified_diff(text.splitlines(True), new.splitlines(True), name, name)
+    diff = "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
+    if args.json:
+        print_json({"situations": _situation_counts(situations), "diff": diff,
+                    "proposals": [_proposal_json(one, by_hand) for one in found]})  # fmt: skip
+    else:
+        print_lines([_learnt_from(situations), *_proposal_lines(found, by_hand)])
+        print(diff, end="")
+    print_notes(situations.remarks)
+    if args.apply and diff:
+        replace_file(path, mark + new)
+        print_notes([f"wrote {len(found) - len(by_hand)} changes to {path}"])
+    return 0
+
+
+def _text_of(path: Path) -> tuple[str, str]:
+    """Return the text of a file, and the mark of its encoding at the beginning, if any."""
+    text = path.read_bytes().decode("utf-8")
+    return text.removeprefix("\ufeff"), "\ufeff" if text.startswith("\ufeff") else ""
+
+
+def _situations(args: argparse.Namespace, fmea: Fmea) -> KnownSituations:
+    """Return the situations of all records; one that nobody watched is evaluated here."""
+    found, own = KnownSituations(), str(fmea_path(args.where).parent)
+    for where in args.records or [own]:
+        archive = None if is_url(where) else archive_in(where)
+        if archive is not None and not archive[1]:
+            raise UsageError(f"{where} has several robots", f"name one: {where}/journals/ROBOT")
+        with opened(where) as record:
+            from_ns = time_of("--from", args.from_, record.time_ns)
+            to_ns = time_of("--to", args.to, record.time_ns)
+            said = _said_at_server(where, from_ns, to_ns) if is_url(where) else {}
+            if not args.replay and was_found(record):
+                faults = recorded_faults(record, from_ns, to_ns)
+            else:
+                local = _local(record, where)
+                faults = evaluated_faults(*_watching(own), local)
+            found += read_situations(record, faults, said, from_ns, to_ns)
+    return with_known_modes(found, fmea.modes)
+
+
+def _watching(where: str) -> tuple[Knowledge, MonitoringPlan]:
+    """Return what a watcher of a folder knows."""
+    folder = load_folder(where)
+    plan, _ = load_plan(folder)
+    knowledge, problems = load_knowledge(folder, plan)
+    raise_errors(problems)
+    assert knowledge is not None
+    return knowledge, plan
+
+
+def _local(record: Record, where: str) -> Record:
+    if isinstance(record, LocalRecord):
+        return record
+    what = f"nobody watched {where}: it has no symptoms"
+    raise UsageError(what, "records on this computer are evaluated by 'learn' itself")
+
+
+def _said_at_server(where: str, from_ns: int | None, to_ns: int | None) -> dict[str, list[str]]:
+    """Return the causes that people gave on a server, by diagnosis."""
+    fleet, robot = robot_at(where)
+    with fleet:
+        names = [one.id for one in fleet.diagnoses(robot, from_ns, to_ns)]
+        details = {name: fleet.diagnosis(robot, name) for name in names}
+    return {
+        name: [str(cause["failure_mode"]) for cause in one.get("causes", ())]
+        for name, one in details.items()
+    }
+
+
+def _situation_counts(found: KnownSituations) -> dict[str, float]:
+    repairs = sum(bool(one.faults) for one in found.situations)
+    return {
+        "repairs": repairs, "without_fault": len(found.situations) - repairs,
+        "unsaid": found.unsaid, "hours": round(found.hours, 3),
+    }  # fmt: skip
+
+
+def _learnt_from(found: KnownSituations) -> str:
+    of = _situation_counts(found)
+    unsaid = f"; of {of['unsaid']} diagnoses nobody said the cause" if found.unsaid else ""
+    return (
+        f"{of['repairs']} repairs, {of['without_fault']} situations without a fault, "
+        f"{found.hours:.3g} h of record{unsaid}"
+    )
+
+
+def _proposal_lines(found: Sequence[Proposal], by_hand: Collection[Proposal]) -> Iterator[str]:
+    """Yield two lines for each proposal: the number, and the reason."""
+    for one in found:
+        place = " ".join(filter(None, (one.mode, one.kind, one.symptom)))
+        by_whom = ", to be written by hand" if one in by_hand else ""
+        yield f"{place}: {one.now} -> {one.value}{by_whom}"
+        yield f"  {one.reason}"
+    yield "" if found else "nothing to change"
+
+
+def _proposal_json(one: Proposal, by_hand: Collection[Proposal]) -> dict[str, Any]:
+    return {
+        "kind": one.kind, "mode": one.mode, "symptom": one.symptom, "now": one.now,
+        "value": one.value, "reason": one.reason, "in_diff": one not in by_hand,
+    }  # fmt: skip
+
+
 _ACTIONS: dict[str, Callable[..., Any]] = {
+    "learn": _learn,
     "check": _check,
     "table": _table,
     "criticality": _criticality,

@@ -1,40 +1,54 @@
-"""Robot folders: start one from a sample; check one without touching a device."""
+"""Check a robot folder without touching a device; show what would be done with it."""
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import json
-import shlex
 import shutil
 import textwrap
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from amberbox.agent.command_trust import CommandTrust, read_trust, trust_path
+from amberbox.agent.recovery import recovery_problems
+from amberbox.agent.recovery_actions import RecoveryAction, causes_by_action, recovery_actions
+from amberbox.agent.unit_tests import collect, problems_of
 from amberbox.blackbox.robot_folder.folder import (
     BLACK_BOX_FILE,
     ROBOT_FILE,
-    SOURCES,
     PlannedItem,
     RobotFolder,
     inspect_folder,
-    load_folder,
     planned_items,
 )
 from amberbox.blackbox.robot_folder.robot_yaml import trigger_problems
 from amberbox.cli._output import in_columns, print_lines
 from amberbox.cli.action import action_rows
+from amberbox.cli.experiment_files import summary
 from amberbox.consult.folder_knowledge import load_knowledge, monitor_addresses, rule_problems
-from amberbox.core.errors import ConfigurationError, Problem, UsageError
-from amberbox.core.names import derive_id
-from amberbox.core.plugins import get
+from amberbox.core.errors import (
+    AmberboxError,
+    ConfigurationError,
+    Problem,
+    did_you_mean,
+)
 from amberbox.core.redaction import masked_values
 from amberbox.core.yaml_nodes import load_yaml
+from amberbox.detection.model_file import load_model
+from amberbox.diagnosis.fmea.loader import FILE as FMEA
+from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.models import ModelFile, check_models, unknown_modes
 from amberbox.experiments.action import DeclaredAction, read_actions
+from amberbox.experiments.experiment import FOLDER as EXPERIMENTS
+from amberbox.experiments.profile import Experiment, list_experiments, read_experiment
+from amberbox.experiments.unit_tests import ACTION_PREFIX, TestCollection, UnitTest
 from amberbox.monitoring.component_files import FOLDER as COMPONENTS
 from amberbox.monitoring.plan import (
     MonitoringPlan,
-    list_recovery_actions,
     monitor_of,
     needs_text,
     plan_data,
@@ -43,93 +57,6 @@ from amberbox.monitoring.plan import (
 )
 from amberbox.monitoring.plan_loader import load_plan
 from amberbox.monitoring.rule_tests import find_rule_tests, run_rule_tests
-
-_ROBOT = """\
-# Who this robot is, and where its record goes. All keys: docs/robot/configuration.md
-
-id: "{id}"                 # name in addresses and on the server: a-z 0-9 _ . -
-model: ""                  # make and model
-software_version: ""       # version of the robot's own software
-
-store:
-  path: store              # folder of the record, relative to this one
-  # quota: 50 GB           # most that the record may take; the oldest data go first
-  # min_free: 1 GB         # room that stays free on the partition
-  # keep_min: 24 h         # the newest data are not deleted for room
-  # ring_s: 5 min          # how long topics with 'keep: ring' are kept
-
-# 'amberbox join' with the line that a fleet server printed writes the server here:
-# server:
-#   url: https://fleet.example.org:8443
-#   copy: always           # when journals are copied: docked, on_request, network NAME
-#   rate: 0                # most bytes in a second; 0 for as fast as it goes
-"""
-
-_BLACK_BOX = """\
-# What the box listens to: one block per source. 'amberbox plugins' lists the sources,
-# 'amberbox plugins {plugin}' shows all keys of this one.
-
-- default_parameters:
-    max_frequency: 100     # Hz, for listed topics that do not state their own
-
-{sample}"""
-
-
-def configure_new(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this verb."""
-    parser.add_argument("folder", help="folder to make, or one without these files")
-    parser.add_argument(
-        "--from", dest="source", default="sim", metavar="SOURCE", help="source to start with [sim]"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def run_new(args: argparse.Namespace) -> int:
-    """Write the files; never overwrites any."""
-    folder = Path(args.folder)
-    plugin = get(SOURCES, args.source, defines=("Config", "Source"))
-    module = plugin.load()
-    more = _files_of_source(module.FOLDER) if hasattr(module, "FOLDER") else {}
-    sample = more.pop(BLACK_BOX_FILE, module.SAMPLE)
-    robot = _ROBOT.replace("{id}", derive_id(folder.resolve().name))
-    black_box = _BLACK_BOX.replace("{plugin}", plugin.name).replace("{sample}", sample)
-    files = {ROBOT_FILE: robot, BLACK_BOX_FILE: black_box, **more}
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"'{folder}' is a file", "name a folder")
-    there = [name for name in files if (folder / name).exists()]
-    if there:
-        what = f"'{folder}' has {_file_names(there)} already, nothing was written"
-        raise UsageError(
-            what, f"edit what is there, or name another folder; amberbox check {folder}"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
-    load_folder(folder)
-    if args.json:
-        print(json.dumps({"folder": str(folder), "files": sorted(files)}))
-    else:
-        print(f"wrote {_file_names(files)} in {folder}")
-        word = shlex.quote(str(folder))
-        watch = (
-            f", and beside it amberbox watch {word}" if "components" in _file_names(files) else ""
-        )
-        print(f"next: look at them, then amberbox check {word}, amberbox record {word}{watch}")
-    return 0
-
-
-def _files_of_source(folder: Path) -> dict[str, str]:
-    """Return the files that belong to a source, such as its monitors, by their paths."""
-    kinds = {".yaml", ".pl"}
-    paths = sorted(path for path in folder.rglob("*") if path.suffix in kinds and path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in paths}
-
-
-def _file_names(names: Iterable[str]) -> str:
-    """Return the names of files, with whole folders instead of their contents."""
-    return " and ".join(sorted({name.partition("/")[0] for name in names}))
-
 
 _WIDTH = 100  # columns of the output where there is no terminal
 
@@ -147,20 +74,110 @@ def run_check(args: argparse.Namespace) -> int:
     """Print all problems and notes, and the plan if there is no error; return 0 or 2."""
     folder, problems = inspect_folder(args.folder)
     items = planned_items(folder, problems) if folder else []
-    plan = _monitors(folder, problems) if folder and Path(args.folder).is_dir() else None
+    actions, found = read_actions(Path(args.folder))
+    tests = collect(Path(args.folder))
+    plan, fmea, recovery = None, None, list[RecoveryAction]()
+    if folder and Path(args.folder).is_dir():
+        plan, fmea = _monitors(folder, tests, problems)
+        recovery = recovery_actions(plan, fmea, actions)
+        problems += _recovery(folder, actions, plan, fmea)
     problems += _triggers(folder, items, plan) if folder else []
     problems += _not_judged(Path(args.folder)) if folder is None else []
-    actions, found = read_actions(Path(args.folder))
     problems += found
+    problems += problems_of(Path(args.folder), tests)
+    orders = [*actions, *(ACTION_PREFIX + test.name for test in tests.tests)]
+    trust, found = _trust(folder, orders) if folder else (None, [])
+    problems += found
+    experiments, found = _experiments(Path(args.folder))
+    problems += [*found, *_unknown_modes(experiments, folder, plan)]
+    models, found = check_models(Path(args.folder))
+    problems += found
+    problems += unknown_modes(models, fmea.modes) if fmea is not None else ()
+    problems += _detection(folder) if folder else []
     ok = not any(problem.is_error for problem in problems)
     if args.json:
         monitoring = {} if plan is None else {"monitoring": plan_data(plan)}
-        able = {"actions": [action.announced() for action in actions.values()]}
+        causes = causes_by_action(recovery)
+        able = {
+            "actions": [
+                action.announced() | {"recovers": causes.get(action.name, [])}
+                for action in actions.values()
+            ],
+            "tests": [test.announced() for test in tests.tests],
+            "recovery_actions": [
+                {"cause": one.cause, "text": one.text, "command": one.command(args.folder),
+                 "problem": one.problem}
+                for one in recovery
+            ],
+            "experiments": [summary(experiment) for experiment in experiments],
+            "models": [{"name": model.name, "kind": model.kind} for model in models],
+        }  # fmt: skip
         print(json.dumps(_check_json(folder, items, problems, ok) | monitoring | able, indent=2))
     else:
-        lines = _action_lines(actions.values())
+        lines = [
+            *_recovery_lines(recovery), *_action_lines(actions.values()),
+            *_test_lines(tests.tests), *_experiment_lines(experiments), *_model_lines(models),
+            *_trust_lines(trust),
+        ]  # fmt: skip
         print_lines(_check_lines(args.folder, folder, items, problems, plan, lines, args.modes))
     return 0 if ok else ConfigurationError.exit_code
+
+
+def _trust(
+    folder: RobotFolder, actions: Collection[str]
+) -> tuple[CommandTrust | None, list[Problem]]:
+    """Read the trust file that the folder names; return it and notes on what is wrong with it.
+
+    They are no errors of the folder, which records and monitors all the same: the robot refuses
+    signed commands until they are mended.
+    """
+    path = trust_path(folder)
+    if path is None:
+        return None, []
+    nobody = "the robot takes no signed command until it is right"
+
+    def note(problem: Problem) -> Problem:
+        what = f"{problem.what}; {nobody}"
+        return replace(problem, what=what, is_error=False)
+
+    try:
+        trust = read_trust(path)
+    except ConfigurationError as error:
+        return None, [note(problem) for problem in error.problems]
+    except AmberboxError as error:
+        return None, [note(Problem(str(path), 1, "file", error.what, error.hint))]
+    unknown = [
+        Problem(str(path), 1, f"people.{name}.actions", f"no action is called '{pattern}'"
+                f"{did_you_mean(pattern, actions)}", is_error=False)
+        for name, person in trust.people.items()
+        for pattern in person.actions
+        if pattern != "*" and not fnmatch.filter(actions, pattern)
+    ]  # fmt: skip
+    return trust, unknown
+
+
+def _detection(folder: RobotFolder) -> list[Problem]:
+    """Return a note if the model of the detectors is of no use; all else runs without it."""
+    options = folder.robot.detection
+    if options is None:
+        return []
+    node = load_yaml(folder.path / ROBOT_FILE, [])
+    place = (node.mapping or {}).get("detection") if node is not None else None
+    try:
+        load_model(options.file(folder.path))
+    except AmberboxError as error:
+        what = f"{error.what}; no detector runs until it is right"
+        line = 1 if place is None else place.line
+        where = str(folder.path / ROBOT_FILE)
+        return [Problem(where, line, "detection.model", what, error.hint, is_error=False)]
+    return []
+
+
+def _trust_lines(trust: CommandTrust | None) -> list[str]:
+    if trust is None:
+        return []
+    rows = [(name, one.risk, ", ".join(one.actions)) for name, one in trust.people.items()]
+    return [f"would take commands of server {trust.server}:", *in_columns(rows), ""]
 
 
 def _not_judged(path: Path) -> list[Problem]:
@@ -171,8 +188,25 @@ def _not_judged(path: Path) -> list[Problem]:
     return [Problem(str(path / COMPONENTS), 1, "file", what, is_error=False)]
 
 
-def _monitors(folder: RobotFolder, problems: list[Problem]) -> MonitoringPlan:
-    """Check monitors with their tests, failure modes and rules; append their problems."""
+def _recovery(
+    folder: RobotFolder,
+    actions: Mapping[str, DeclaredAction],
+    plan: MonitoringPlan,
+    fmea: Fmea | None,
+) -> list[Problem]:
+    """Check the rules of recovery against everything that the folder has."""
+    rules, unread = folder.robot.recovery, list[Problem]()
+    node = load_yaml(folder.path / ROBOT_FILE, unread) if rules else None
+    return [] if node is None else list(recovery_problems(node, rules, actions, plan, fmea))
+
+
+def _monitors(
+    folder: RobotFolder, tests: TestCollection, problems: list[Problem]
+) -> tuple[MonitoringPlan, Fmea | None]:
+    """Check monitors with their tests, failure modes and rules; append their problems.
+
+    Unit tests are checked for the failure modes that they name.
+    """
     plan, found = load_plan(folder)
     problems += found
     rules = find_rule_tests(folder.path, skip=folder.store_path)
@@ -187,8 +221,32 @@ def _monitors(folder: RobotFolder, problems: list[Problem]) -> MonitoringPlan:
         for component in plan.components
         if not component.modes and not any(need.component for need in component.dependencies)
     ]
-    problems += [*load_knowledge(folder, plan)[1], *rule_problems(folder)]
-    return plan
+    knowledge, found = load_knowledge(folder, plan)
+    problems += [*found, *rule_problems(folder)]
+    modes = () if knowledge is None else knowledge.fmea.modes
+    problems += [
+        Problem(
+            str(folder.path / test.file), test.line, test.name,
+            f"there is no failure mode '{mode}'{did_you_mean(mode, modes)}", is_error=False,
+        )
+        for test in tests.tests for mode in test.about if mode not in modes
+    ]  # fmt: skip
+    if knowledge is not None and not tests.problems:
+        problems += _not_collected(folder, knowledge, [test.name for test in tests.tests])
+    return plan, None if knowledge is None else knowledge.fmea
+
+
+def _not_collected(
+    folder: RobotFolder, knowledge: Knowledge, names: Collection[str]
+) -> Iterator[Problem]:
+    """Yield a problem for each unit test of ``fmea.yaml`` that pytest does not find.
+
+    Its names are compared with the text of the files before; values of parameters only here.
+    """
+    for test in knowledge.fmea.tests.values():
+        if test.kind == "unit_test" and test.run not in names:
+            what = f"pytest finds no unit test '{test.run}'{did_you_mean(test.run, names)}"
+            yield Problem(str(folder.path / FMEA), 1, f"tests.{test.id}.unit_test", what)
 
 
 def _triggers(
@@ -244,12 +302,19 @@ def _check_lines(
 def _monitored(plan: MonitoringPlan | None, each_mode: bool) -> list[str]:
     if plan is None or not plan.components:
         return []
-    actions = list(list_recovery_actions(plan))
-    shown = ["recovery actions, not carried out:", *in_columns(actions), ""] if actions else []
     width = shutil.get_terminal_size((_WIDTH, 0)).columns
     each_mode = each_mode or len(plan.modes()) <= _FEW_MODES
     table = in_full(plan, width) if each_mode else in_short(plan, width)
-    return [f"would monitor: {plan_text(plan)}", *table, "", *shown]
+    return [f"would monitor: {plan_text(plan)}", *table, ""]
+
+
+def _recovery_lines(found: Sequence[RecoveryAction]) -> list[str]:
+    width = shutil.get_terminal_size((_WIDTH, 0)).columns
+    rows = [(one.cause, one.call or f"only a text: {one.text}", one.problem) for one in found]
+    entries = _entries([(cause, f"{what} ({why})" if why else what) for cause, what, why in rows],
+                       width, "  ")  # fmt: skip
+    head = "recovery actions, for 'amberbox action run':"
+    return [head, *(line for entry in entries for line in entry), ""] if rows else []
 
 
 def _action_lines(actions: Collection[DeclaredAction]) -> list[str]:
@@ -260,6 +325,54 @@ def _action_lines(actions: Collection[DeclaredAction]) -> list[str]:
     ]
     entries = _entries(rows, width, "  ")
     return ["can do:", *(line for entry in entries for line in entry), ""] if actions else []
+
+
+def _test_lines(tests: Sequence[UnitTest]) -> list[str]:
+    width = shutil.get_terminal_size((_WIDTH, 0)).columns
+    rows = [(test.name, test.risk, test.description) for test in tests]
+    entries = _entries(rows, width, "  ")
+    return ["can test:", *(line for entry in entries for line in entry), ""] if tests else []
+
+
+def _experiments(folder: Path) -> tuple[list[Experiment], list[Problem]]:
+    """Return the experiments of a robot folder that can be run, and the problems of all."""
+    found, problems = [], list[Problem]()
+    for path in list_experiments(folder / EXPERIMENTS):
+        experiment, of_file = read_experiment(path, folder)
+        problems += of_file
+        found += [] if experiment is None else [experiment]
+    return found, problems
+
+
+def _unknown_modes(
+    experiments: Sequence[Experiment], folder: RobotFolder | None, plan: MonitoringPlan | None
+) -> list[Problem]:
+    """Return the failure modes that an experiment is about and that nothing declares."""
+    about = [(one, mode) for one in experiments for mode in one.options.about]
+    knowledge = load_knowledge(folder, plan)[0] if about and folder and plan else None
+    known = knowledge.fmea.modes if knowledge is not None else {}
+    return [
+        Problem(str(one.path), 1, "experiment.about", f"there is no failure mode '{mode}'"
+                f"{did_you_mean(mode, known)}")
+        for one, mode in about
+        if knowledge is not None and mode not in known
+    ]  # fmt: skip
+
+
+def _experiment_lines(experiments: Sequence[Experiment]) -> list[str]:
+    width = shutil.get_terminal_size((_WIDTH, 0)).columns
+    rows = [
+        (one.name, ", ".join(one.person_roles) or "-", one.options.description or one.title)
+        for one in experiments
+    ]
+    entries = _entries(rows, width, "  ")
+    lines = [line for entry in entries for line in entry]
+    return ["experiments:", *lines, ""] if lines else []
+
+
+def _model_lines(models: Sequence[ModelFile]) -> list[str]:
+    rows = [(model.name, model.kind) for model in models]
+    return ["models:", *in_columns(rows), ""] if models else []
 
 
 def _count_text(of: Sequence[object], what: str) -> str:

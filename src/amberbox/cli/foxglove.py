@@ -12,19 +12,23 @@ from amberbox.blackbox.query.foxglove import (
     ColumnFrames,
     LiveColumns,
     LiveMessages,
+    MergedFrames,
     MessageFrames,
     Playback,
     Server,
     ViewerListener,
     span_of,
 )
+from amberbox.blackbox.query.foxglove_layout import FILE as LAYOUT
+from amberbox.blackbox.query.foxglove_layout import recorded_topics, write_layout
 from amberbox.blackbox.store.store import store_path
 from amberbox.cli._arguments import add_range_only, opened
 from amberbox.cli._arguments import span_of as asked_span
-from amberbox.cli._output import print_notes
+from amberbox.cli._output import print_notes, writable
 from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.core.tls import is_loopback
+from amberbox.monitoring.viewer_findings import FindingFrames, LiveFindings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,25 +46,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--speed", type=float, default=1.0, metavar="X", help="of the playback (default: 1)"
     )
+    parser.add_argument(
+        "--layout", nargs="?", const=LAYOUT, metavar="FILE",
+        help=f"write a layout for viewers with the panels of this record, and end ({LAYOUT})",
+    )  # fmt: skip
     parser.add_argument("--port", type=int, default=PORT, help=f"default: {PORT}")
     parser.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C, or write a layout."""
     _check(args)
+    if args.layout is not None:
+        with opened(args.where) as record:
+            topics = recorded_topics(record, args.item, columns=args.columns)
+        path = writable(args.layout)
+        write_layout(path, topics)
+        print(f"wrote {path}: import it in the viewer's menu of layouts")
+        return 0
     stop = threading.Event()
     try:
         if args.live:
-            path, server = store_path(args.where), Server(ViewerListener())
-            source = (LiveColumns if args.columns else LiveMessages)(path, args.item)
-            source.prepare(server)
-            server.start(f"amberbox {path.name}", args.host, args.port)
-            try:
-                _greet(args, server, "live")
-                source.run(server, stop)
-            finally:
-                server.stop()
+            _live(args, stop)
         else:
             _range(args, stop)
     except KeyboardInterrupt:
@@ -85,22 +92,48 @@ def _check(args: argparse.Namespace) -> None:
         )
 
 
+def _live(args: argparse.Namespace, stop: threading.Event) -> None:
+    path, server = store_path(args.where), Server(ViewerListener())
+    source = (LiveColumns if args.columns else LiveMessages)(path, args.item)
+    source.prepare(server)
+    findings = LiveFindings(path)
+    finding = threading.Thread(target=findings.run, args=(server, stop), daemon=True)
+    if not args.item:
+        findings.prepare(server)
+    server.start(f"amberbox {path.name}", args.host, args.port)
+    try:
+        _greet(args, server, "live")
+        if not args.item:
+            finding.start()
+        source.run(server, stop)
+    finally:
+        stop.set()
+        server.stop()
+
+
 def _range(args: argparse.Namespace, stop: threading.Event) -> None:
     with opened(args.where) as record:
         window = asked_span(args, record)
         frames = (ColumnFrames if args.columns else MessageFrames)(record, args.item, window)
         span = frames.current.ask(lambda catalogue: span_of(catalogue, window))
         print_notes(frames.report.missing)
-        playback = Playback(frames, span, args.speed)
-        server = Server(ViewerListener(playback.control))
-        for topic in frames.topics:
-            server.advertise(topic)
-        server.start(f"amberbox {record.path.name}", args.host, args.port, span)
-        try:
-            _greet(args, server, f"{format_time(span[0])} to {format_time(span[1])}")
-            playback.run(server, stop)
-        finally:
-            server.stop()
+        parts = [frames] if args.item else [frames, FindingFrames(record, window)]
+        serve_range(args, Playback(MergedFrames(parts), span, args.speed), record.path.name, stop)
+
+
+def serve_range(
+    args: argparse.Namespace, playback: Playback, name: str, stop: threading.Event
+) -> None:
+    """Serve a range to viewers, who control its playback, until stopped."""
+    server, span = Server(ViewerListener(playback.control)), playback.span
+    for topic in playback.frames.topics:
+        server.advertise(topic)
+    server.start(f"amberbox {name}", args.host, args.port, span)
+    try:
+        _greet(args, server, f"{format_time(span[0])} to {format_time(span[1])}")
+        playback.run(server, stop)
+    finally:
+        server.stop()
 
 
 def _greet(args: argparse.Namespace, server: Server, what: str) -> None:

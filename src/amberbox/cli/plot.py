@@ -6,7 +6,8 @@ import argparse
 import html
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from importlib.resources import files
@@ -22,6 +23,7 @@ from amberbox.cli._arguments import add_range, add_where, add_window, opened, wi
 from amberbox.cli._output import print_notes, writable
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.notes import RecordedNote
 from amberbox.core.timestamps import format_time
 from amberbox.core.types import Column, Gap, IntArray, Ragged
 
@@ -50,6 +52,8 @@ class RecordPlot:
     gaps: tuple[tuple[int, int, str], ...]
     rows: int
     notes: tuple[str, ...]
+    remarks: tuple[tuple[int, int, str], ...] = ()
+    """Notes of people on the item, or on nothing particular: begin, end (ns) and text."""
 
     def units(self) -> list[str]:
         """Return the units in use; each has a panel of its own."""
@@ -77,7 +81,20 @@ def drawing(record: Record, args: argparse.Namespace) -> RecordPlot:
     shown, breaks = _shown_rows(table, fields, (times, holes), gaps, args.points)
     curves = tuple(_curve(table, field, times, shown, breaks) for field in fields)
     clock = "time of receipt" if args.by == "received" else "own time stamps"
-    return RecordPlot(table.item, clock, args.local, curves, gaps, len(table), table.notes)
+    remarks = _remarks(record, table.item, times)
+    return RecordPlot(table.item, clock, args.local, curves, gaps, len(table), table.notes, remarks)
+
+
+def _remarks(record: Record, item: str, times: IntArray) -> tuple[tuple[int, int, str], ...]:
+    first, last = int(times.min()), int(times.max())
+    notes: Sequence[RecordedNote] = ()
+    with suppress(AmberboxError):  # on a server the caller may not be allowed to read them
+        notes = record.annotations(first, last + 1)
+    return tuple(
+        (max(note.at_ns, first), min(note.to_ns or note.at_ns, last), f"{note.text} ({note.who})")
+        for note in notes
+        if note.about.partition(".")[0] in ("", item)
+    )
 
 
 def gaps_in_plot(record: Record, item: str, times: IntArray) -> tuple[tuple[int, int, str], ...]:
@@ -139,6 +156,8 @@ def _curve(
 
 _PANEL_INCHES = 3.2
 _GAP_COLOUR = "0.85"
+_NOTE_COLOUR = "tab:orange"
+_NOTE_LENGTH = 80  # characters of a note in an image
 
 
 def draw_image(plot: RecordPlot, kind: str) -> bytes:
@@ -170,6 +189,14 @@ def _panel(panel: Any, plot: RecordPlot, curves: list[Curve], unit: str) -> None
         label = "gap" if number == 0 else None
         edges = _dates(np.array([from_ns, to_ns]))
         panel.axvspan(edges[0], edges[1], color=_GAP_COLOUR, linewidth=0, label=label)
+    for number, (from_ns, to_ns, text) in enumerate(plot.remarks):
+        edges = _dates(np.array([from_ns, to_ns]))
+        panel.axvspan(edges[0], edges[1], color=_NOTE_COLOUR, alpha=0.3, linewidth=1)
+        panel.annotate(
+            " ".join(text.split())[:_NOTE_LENGTH], (edges[0], 1.0 - 0.07 * (number % 10)),
+            xycoords=("data", "axes fraction"), fontsize="x-small", va="top",
+            parse_math=False,
+        )  # fmt: skip
     panel.set_ylabel(unit)
     panel.grid(visible=True, alpha=0.3)
     panel.legend(loc="best", fontsize="small")
@@ -209,6 +236,9 @@ def draw_page(plot: RecordPlot) -> bytes:
         ],
         "gaps": [
             [(from_ns - t0) / NS, (to_ns - t0) / NS, reason] for from_ns, to_ns, reason in plot.gaps
+        ],
+        "notes": [
+            [(from_ns - t0) / NS, (to_ns - t0) / NS, text] for from_ns, to_ns, text in plot.remarks
         ],
     }
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""List sources, monitor modes, probes and kinds of actions, or explain one of them."""
+"""List sources, monitor modes, probes, kinds of actions and detectors, or explain one of them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from amberbox.cli._output import in_columns, print_lines
 from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.core.options import OptionRow, describe
 from amberbox.core.plugins import Plugin, find, install_hint, missing_packages
+from amberbox.detection.model_file import DETECTOR_DEFINES, DETECTORS
 from amberbox.experiments.action import ACTIONS, DEFINES
 from amberbox.monitoring.component_files import MODE_DEFINES, MODES, PROBE_DEFINES, PROBES
 
@@ -35,6 +36,7 @@ KINDS = {
     "mode": PluginKind(MODES, MODE_DEFINES, "named by 'monitor:' in a mode file"),
     "probe": PluginKind(PROBES, PROBE_DEFINES, "what modes ask the robot's computer for"),
     "action": PluginKind(ACTIONS, DEFINES, "named by 'kind:' in actions/*.yaml"),
+    "detector": PluginKind(DETECTORS, DETECTOR_DEFINES, "learnt by 'amberbox learn'"),
 }
 
 
@@ -43,7 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "name",
         nargs="?",
-        help="a source, mode, probe or kind of action: show a sample and its keys",
+        help="a source, mode, probe, kind of action or detector: show a sample and its keys",
     )
     parser.add_argument("--kind", choices=KINDS, help="only plugins of this kind")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -109,7 +111,8 @@ def _one(name: str, kinds: Sequence[str]) -> tuple[str, Plugin]:
 
 
 def _source_details(module: Any) -> dict[str, Any]:
-    return {"sample": module.SAMPLE, "options": [asdict(row) for row in describe(module.Config)]}
+    sample = getattr(module, "SAMPLE", "")
+    return {"sample": sample, "options": [asdict(row) for row in describe(module.Config)]}
 
 
 def _mode_details(module: Any) -> dict[str, Any]:
@@ -126,7 +129,9 @@ def _probe_details(module: Any) -> dict[str, Any]:
 
 
 def _source_text(details: Mapping[str, Any]) -> Iterator[str]:
-    yield from ("", details["sample"].rstrip(), "", "keys:")
+    if details["sample"]:
+        yield from ("", details["sample"].rstrip())
+    yield from ("", "keys:")
     yield from _option_table(details["options"])
 
 
@@ -155,12 +160,14 @@ _DETAILS = {
     "mode": _mode_details,
     "probe": _probe_details,
     "action": _source_details,
+    "detector": _source_details,
 }
 _SHOWN = {
     "source": _source_text,
     "mode": _mode_text,
     "probe": _probe_text,
     "action": _source_text,
+    "detector": _source_text,
 }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import queue
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli._output import in_columns, print_json, print_lines, print_notes
 from amberbox.core.errors import UsageError
+from amberbox.core.interrupt import called_by_signals
 from amberbox.core.probe import ProbeOrder, sorted_orders
 from amberbox.monitoring.probe_runner import (
     HERE,
@@ -87,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
         return 0 if all(row["ok"] for row in rows.values()) else 1
     if args.once:
         raise UsageError("--once does not go with --publish: nobody would be listening yet")
-    with _stopped_by_signal() as stop:
+    stop = threading.Event()
+    with called_by_signals(stop.set):
         if args.publish is None:
             _print_on(orders, extra_dirs, args.json, stop)
         else:
@@ -114,14 +115,6 @@ def _orders(args: argparse.Namespace) -> tuple[Sequence[ProbeOrder], Sequence[Pa
         load_probe(kind, extra_dirs)
         orders.append(ProbeOrder(kind, subject))
     return sorted_orders(orders), extra_dirs
-
-
-@contextmanager
-def _stopped_by_signal() -> Iterator[threading.Event]:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    yield stop
 
 
 @contextmanager

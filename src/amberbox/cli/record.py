@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import threading
 import time
@@ -15,6 +14,7 @@ from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli._output import warn_readable
 from amberbox.core.files import keep_to_group
+from amberbox.core.interrupt import called_by_signals
 from amberbox.core.safe_text import OWN_ESCAPE
 from amberbox.core.systemd import is_service
 from amberbox.core.units import bytes_text, in_unit
@@ -49,8 +49,11 @@ def run(args: argparse.Namespace) -> int:
     warn_readable(folder.store_path)
     recorder = Recorder(folder)
     recorder.pipeline.on_event = print_event
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: recorder.stop.set())
+    with called_by_signals(recorder.stop.set):
+        return _run(recorder, args)
+
+
+def _run(recorder: Recorder, args: argparse.Namespace) -> int:
     if args.duration is not None:
         timer = threading.Timer(args.duration, recorder.stop.set)
         timer.daemon = True
@@ -77,7 +80,9 @@ def print_event(kind: str, text: str) -> None:
     """Print an event about a problem to stderr; the record holds all events."""
     if kind not in _NO_TROUBLE:
         with suppress(OSError):  # stderr may be closed; recording goes on
-            print(f"{time.strftime('%H:%M:%S')} {kind}: {text}", file=sys.stderr, flush=True)
+            # in one piece: events come from several threads
+            sys.stderr.write(f"{time.strftime('%H:%M:%S')} {kind}: {text}\n")
+            sys.stderr.flush()
 
 
 def _seconds(text: str) -> float:

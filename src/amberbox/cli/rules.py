@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli._arguments import add_range_only, add_robot, check_time, opened, robot_at, span_of
+from amberbox.cli._arguments import (
+    add_range_only,
+    add_robot,
+    budget_of,
+    check_time,
+    opened,
+    robot_at,
+    span_of,
+)
 from amberbox.cli._output import print_json, print_notes, writable
 from amberbox.client.address import is_url
 from amberbox.consult.rule_lookups import RuleTarget, rule_facts, rule_target
@@ -109,8 +116,7 @@ def _answer(program: Program, args: argparse.Namespace) -> int:
         if args.json:
             print_json(_NOTHING.to_json())
         return 0
-    end_s = time.monotonic() + args.seconds
-    budget = Budget(steps=args.steps, is_over=lambda: time.monotonic() > end_s)
+    budget = budget_of(args, steps=args.steps)
     want: Want = "why" if args.why else "why_not" if args.why_not else None
     found = ask(program, args.ask, budget, want)
     if args.json:

@@ -119,8 +119,12 @@ def _made(address: Address, name: str, pin: str, authority: str) -> str:
     password = secret(f"password of {name} at {address.url}: ")
     context = credentials.context_of(address.url, pin, StoredSignIn("", pin, authority))
     wire = ApiConnection(address.url, context=context)
+    called = f"amberbox on {socket.gethostname()}"
     try:
-        return make_token(wire, name, password, f"amberbox on {socket.gethostname()}", SCOPES)
+        return make_token(wire, name, password, called, SCOPES)
+    except UsageError:  # a server from before there were commands does not know their scopes
+        known = [scope for scope in SCOPES if not scope.endswith(":commands")]
+        return make_token(wire, name, password, called, known)
     finally:
         wire.close()
 

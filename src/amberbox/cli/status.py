@@ -15,9 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from amberbox.agent.doctor.processes import LINK_LOCK, LINK_STATE_FILE, link_in_words
+from amberbox.agent.doctor.processes import (
+    LINK_LOCK,
+    LINK_STATE_FILE,
+    MIRROR_LOCK,
+    MIRROR_STATE_FILE,
+    link_in_words,
+    mirror_in_words,
+)
 from amberbox.agent.doctor.processes import SUPERVISOR_LOCK as SUPERVISED
 from amberbox.agent.doctor.subject import read_state
+from amberbox.agent.recovery import read_recovery, recovery_lines
+from amberbox.agent.recovery_actions import command_lines, folder_recoveries
 from amberbox.blackbox.robot_folder.folder import inspect_folder, store_of
 from amberbox.blackbox.store.store import is_locked, is_store, open_store, store_path
 from amberbox.cli._arguments import accept_any_order, add_where, robot_at
@@ -173,11 +182,24 @@ def _show(board: CurrentState, args: argparse.Namespace, plan: MonitoringPlan | 
             print(msgspec.json.encode(message).decode())
     else:
         print_lines(_lines(board, args, plan))
+    if args.format == "table" and not args.json:
+        print_lines(_recovery_lines(args.where, args.component))
     if args.format == "table" and not args.json and not args.component:
         print_lines(_link_lines(args.where))
     print_notes(_changes(args.where, board, plan))
     if board.silence:
         print(f"hint: {_UNKNOWN_HINT.format(where=args.where)}", file=sys.stderr)
+
+
+def _recovery_lines(where: str, component: str | None) -> Iterator[str]:
+    """Yield what the rules of recovery do now, and the commands that may help a component."""
+    yield from recovery_lines(read_recovery(open_store(store_path(where))))
+    folder = inspect_folder(where)[0] if component and not is_store(Path(where)) else None
+    if folder is None or component is None:
+        return
+    found = folder_recoveries(folder)
+    causes = [one.cause for one in found if one.cause.partition("#")[0] == component]
+    yield from (f"by hand: {line}" for line in command_lines(found, causes, where))
 
 
 def _changes(where: str, board: CurrentState, plan: MonitoringPlan | None) -> Iterator[str]:
@@ -202,11 +224,14 @@ def _changes(where: str, board: CurrentState, plan: MonitoringPlan | None) -> It
 
 
 def _link_lines(where: str) -> Iterator[str]:
-    """Yield a line on the link to the server, while the link process runs."""
+    """Yield a line on the link to the server and on the mirror, while their processes run."""
     store = open_store(store_path(where))
     if is_locked(store, LINK_LOCK):
         yield ""
         yield link_in_words(read_state(store, LINK_STATE_FILE), time.time_ns())
+    if is_locked(store, MIRROR_LOCK):
+        yield ""
+        yield mirror_in_words(read_state(store, MIRROR_STATE_FILE), time.time_ns())
 
 
 def _lines(
@@ -568,7 +593,7 @@ def _server_lines(board: CurrentState, tree: StatusTree, args: argparse.Namespac
     facts: Sequence[tuple[str, str]] = (
         ("part of", component.part_of),
         (f"needs {component.needs_rule}".strip(), ", ".join(needs)),
-        ("recovery actions (not carried out)", ", ".join(component.recovery_actions)),
+        ("recovery actions", ", ".join(component.recovery_actions)),
     )
     shown = [f"{what}: {text}" for what, text in facts if text]
     if shown:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,9 +13,10 @@ from amberbox.cli._arguments import accept_relative_times, span_of
 from amberbox.cli._output import print_notes
 from amberbox.core.errors import UsageError
 from amberbox.core.files import keep_to_group
-from amberbox.core.timestamps import format_time
-from amberbox.core.types import Diagnosis, Status
-from amberbox.monitoring.findings import AlarmChange, Finding, Transition
+from amberbox.core.interrupt import called_by_signals
+from amberbox.core.types import Status
+from amberbox.monitoring.finding_lines import FindingLines, shown
+from amberbox.monitoring.findings import Finding
 
 if TYPE_CHECKING:
     from amberbox.blackbox.robot_folder.folder import RobotFolder
@@ -32,13 +31,21 @@ EmitFinding = Callable[["Finding"], None]
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_relative_times(parser)
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("where", metavar="WHERE", nargs="?", default="", help="robot folder, "
+                        "store or recording file; with --auto also ros or ros2, also with "
+                        "=ADDRESS")  # fmt: skip
     parser.add_argument("--folder", metavar="FOLDER", help="robot folder with the components, "
                         "where WHERE is none")  # fmt: skip
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--once", action="store_true", help="say how everything is at the end of "
                      "the record, and exit with 1 if anything is in error")  # fmt: skip
     how.add_argument("--replay", action="store_true", help="go over what is recorded")
+    how.add_argument("--auto", action="store_true", help="record and watch a running robot at "
+                     "once, by what is learned of it in the first seconds [ros]")  # fmt: skip
+    parser.add_argument("--listen", type=float, metavar="SECONDS", help="with --auto, how long to "
+                        "learn [20]")  # fmt: skip
+    parser.add_argument("--keep", metavar="DIR", help="with --auto, keep the robot folder that is "
+                        "made, and its record, here")  # fmt: skip
     parser.add_argument("--speed", default="max", metavar="N", help="replay N times faster than "
                         "it was, or as fast as it goes (max)")  # fmt: skip
     times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
@@ -52,16 +59,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the watcher live, once, or as a replay."""
     keep_to_group()
+    if args.auto:
+        from amberbox.cli._auto import run_auto
+
+        return run_auto(args)
+    if args.listen is not None or args.keep is not None:
+        raise UsageError("--listen and --keep are about what --auto learns", "add --auto")
+    if not args.where:
+        raise UsageError("WHERE is missing", "name a robot folder, or watch --auto ros")
     if not args.replay and (args.from_ or args.to or args.speed != "max"):
         raise UsageError("--from, --to and --speed are about a replay", "add --replay")
     folder = _folder(args)
     plan = _plan(folder)
-    diagnoser = _diagnoser(folder, plan)
     if args.replay:
-        return _replay(args, plan, diagnoser)
+        return _replay(args, plan, folder)
     if args.once:
-        return _once(args, plan, diagnoser)
-    return _live(args, plan, folder, diagnoser)
+        return _once(args, plan, folder)
+    return _live(args, plan, folder)
 
 
 def _folder(args: argparse.Namespace) -> RobotFolder:
@@ -93,12 +107,12 @@ def _plan(folder: RobotFolder) -> MonitoringPlan:
     return plan
 
 
-def _diagnoser(folder: RobotFolder, plan: MonitoringPlan) -> MakeDiagnoser | None:
+def _diagnoser(folder: RobotFolder, plan: MonitoringPlan, store: Store) -> MakeDiagnoser | None:
     """Return the factory of diagnosers from the folder's failure modes; None on errors."""
-    from amberbox.consult.folder_knowledge import load_diagnoser
+    from amberbox.consult.context import load_diagnoser
     from amberbox.diagnosis.fmea.loader import FILE
 
-    make, problems = load_diagnoser(folder, plan)
+    make, problems = load_diagnoser(folder, plan, store.path)
     count = sum(problem.is_error for problem in problems)
     if count:
         errors = f"{count} error{'' if count == 1 else 's'} in {folder.path / FILE}"
@@ -107,12 +121,7 @@ def _diagnoser(folder: RobotFolder, plan: MonitoringPlan) -> MakeDiagnoser | Non
     return make
 
 
-def _live(
-    args: argparse.Namespace,
-    plan: MonitoringPlan,
-    folder: RobotFolder,
-    diagnoser: MakeDiagnoser | None,
-) -> int:
+def _live(args: argparse.Namespace, plan: MonitoringPlan, folder: RobotFolder) -> int:
     from amberbox.blackbox.store.store import create_store
     from amberbox.monitoring.plan import plan_text
     from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
@@ -126,19 +135,22 @@ def _live(
             emit(finding)
 
     store = create_store(folder.store_path)
+    diagnoser = _diagnoser(folder, plan, store)
     watcher = RecordWatcher(WatcherSetup(plan, store, folder, diagnoser=diagnoser), receive)
     if not args.quiet and not args.json:
         print(f"watching {plan.robot}: {plan_text(plan)}", flush=True)
-    with _stoppable() as stop:
+    stop = threading.Event()
+    with called_by_signals(stop.set):
         watcher.run(stop)
     return 0
 
 
-def _once(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> int:
+def _once(args: argparse.Namespace, plan: MonitoringPlan, folder: RobotFolder) -> int:
     from amberbox.blackbox.store.store import is_locked
     from amberbox.monitoring.record_evaluation import end_of_record
 
     with _record(args.where) as store:
+        diagnoser = _diagnoser(folder, plan, store)
         statuses, at_ns, diagnosis = end_of_record(plan, store, diagnoser)
         if not is_locked(store, "main"):
             print_notes([f"nothing is being recorded; this is as of {shown(at_ns)}"])
@@ -153,11 +165,13 @@ def _once(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnos
     return int(any(status.level == "error" for status in statuses))
 
 
-def _replay(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> int:
+def _replay(args: argparse.Namespace, plan: MonitoringPlan, folder: RobotFolder) -> int:
     from amberbox.monitoring.record_evaluation import replay
 
     emit = _printer(args)
-    with _record(args.where) as store, _stoppable() as stop:
+    stop = threading.Event()
+    with _record(args.where) as store, called_by_signals(stop.set):
+        diagnoser = _diagnoser(folder, plan, store)
         part = _part(args, store)
         if part.from_ns is not None and not args.json:
             _log_lead(plan, diagnoser)
@@ -233,86 +247,3 @@ def _status_line(status: Status) -> str:
     name = f"  {status.component}/{status.mode}" if status.mode else status.component
     state = f" {status.state}" if status.state not in ("nominal", status.level) else ""
     return f"{status.level:<7} {name}{state}" + (f": {status.reason}" if status.reason else "")
-
-
-@contextmanager
-def _stoppable() -> Iterator[threading.Event]:
-    """Yield an event that SIGTERM and SIGINT set."""
-    stop = threading.Event()
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-
-
-@dataclass(slots=True)
-class FindingLines:
-    """Formats findings as lines, without repetitions."""
-
-    _reasons: set[tuple[int, str, str]] = field(default_factory=set)
-    _alarms: dict[tuple[str, bool], AlarmChange] = field(default_factory=dict)
-    _answers: dict[str, str] = field(default_factory=dict)
-    _silent: bool = False
-
-    def line(self, finding: Finding) -> str | None:
-        """Return the line for a finding; None if it contains nothing new."""
-        if isinstance(finding, Status):
-            return self._silence(finding)
-        if isinstance(finding, Diagnosis):
-            return self._diagnosis(finding)
-        if isinstance(finding, Transition):
-            text = finding.text.removesuffix(f": {finding.reason}")
-            hint = f" (hint: {finding.hint})" if finding.hint else ""
-            return self._once(finding.at_ns, finding.component, text, finding.reason, hint)
-        return self._alarm(finding) if isinstance(finding, AlarmChange) else None
-
-    def _silence(self, status: Status) -> str | None:
-        """Return a line when the recorder becomes silent, and one when it resumes."""
-        if status.live_only == self._silent:
-            return None
-        self._silent = status.live_only
-        text = f"everything is unknown: {status.reason}" if self._silent else "the record goes on"
-        return f"{shown(status.measured_ns)} {text}"
-
-    def _diagnosis(self, diagnosis: Diagnosis) -> str | None:
-        """Return a line when the leading hypothesis changed."""
-        from amberbox.monitoring.alarm_causes import diagnosis_text, hypotheses_text
-
-        answer = "" if diagnosis.state == "healed" else hypotheses_text(diagnosis.leading())
-        if self._answers.get(diagnosis.id) == answer:
-            return None
-        self._answers[diagnosis.id] = answer
-        return f"{shown(diagnosis.at_ns)} diagnosis {diagnosis.id}: {diagnosis_text(diagnosis)}"
-
-    def _alarm(self, alarm: AlarmChange) -> str | None:
-        """Return a line when an alarm changed, other than in its cause."""
-        key, plain = (alarm.id, alarm.live_only), replace(alarm, cause="", diagnosis="")
-        before = self._alarms.get(key)
-        self._alarms[key] = plain
-        if before is not None and replace(before, changed_ns=alarm.changed_ns) == plain:
-            return None
-        text = f"{alarm.component}: alarm {alarm.id} {alarm.state}"
-        if alarm.state == "healed":
-            return f"{shown(alarm.changed_ns)} {text}"
-        times = f", {alarm.count} times" if alarm.count > 1 else ""
-        cause = f" because of {alarm.cause}" if alarm.cause else ""
-        text += f" ({alarm.severity}{times}){cause}"
-        return self._once(alarm.changed_ns, alarm.component, text, alarm.reason)
-
-    def _once(self, at_ns: int, component: str, text: str, reason: str, hint: str = "") -> str:
-        """Return a line; the same reason at one instant is printed for the first component only."""
-        line = (at_ns, component, reason)
-        if not reason or line in self._reasons:
-            return f"{shown(at_ns)} {text}"
-        if not any(entry[0] == at_ns for entry in self._reasons):
-            self._reasons.clear()
-        self._reasons.add(line)
-        return f"{shown(at_ns)} {text}: {reason}{hint}"
-
-
-def shown(at_ns: int) -> str:
-    """Format a time of the record, UTC, to the millisecond."""
-    return format_time(at_ns)[:23]

@@ -15,6 +15,7 @@ from amberbox.blackbox.store.clocks import ClockBook
 from amberbox.client import table_reader
 from amberbox.client.models import maybe_ns, time_ns
 from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.notes import RecordedNote, in_range
 from amberbox.core.types import Gap, ItemSchema
 
 if TYPE_CHECKING:
@@ -145,6 +146,17 @@ class RemoteRecord(Record):
     def sql(self, statement: str) -> NoReturn:
         """Raise UsageError: a server runs no SQL of its clients."""
         raise UsageError("a server is not asked in SQL", _SQL_HINT)
+
+    def annotations(self, from_: Time = None, to: Time = None) -> list[RecordedNote]:
+        """Return the notes of a range: those of the robot and those of the server."""
+        found = [
+            RecordedNote(
+                note.note, time_ns(note.at), note.who, note.text, maybe_ns(note.to), note.about,
+                note.mission, note.revision,
+            )
+            for note in self.fleet.notes(self.robot, from_, to)
+        ]  # fmt: skip
+        return in_range(found, None, None)
 
     def events(self, from_: Time = None, to: Time = None) -> Table:
         """Return the events of a range, as ``Record.events`` does."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import http.client
+import select
 import ssl
 import threading
 import time
@@ -188,7 +189,9 @@ class ApiConnection:
         return headers
 
     def _ready(self) -> http.client.HTTPConnection:
-        if self._kept is not None and time.monotonic() - self._used_s > _FRESH_S:
+        if self._kept is not None and (
+            time.monotonic() - self._used_s > _FRESH_S or _has_ended(self._kept)
+        ):
             self._drop()
         if self._kept is None:
             self._kept = self._connection()
@@ -227,6 +230,15 @@ class ApiConnection:
         return UnreachableError(
             f"{self.url} does not answer: {why}", "is the address right, and does the server run?"
         )
+
+
+def _has_ended(kept: http.client.HTTPConnection) -> bool:
+    """Return whether the server has closed an idle connection, on which nothing else arrives."""
+    if kept.sock is None or kept.sock.fileno() < 0:
+        return kept.sock is not None
+    poll = select.poll()
+    poll.register(kept.sock, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def _query(query: Query) -> str:
@@ -278,7 +290,8 @@ def follow(
     """Yield changes, a snapshot first; resume after a lost connection.
 
     Raises NotSignedInError or NotAllowedError when the server refuses, UsageError without the
-    package websockets or for an invalid request, UnreachableError if the first connection fails.
+    package websockets or for an invalid request, UnreachableError if the first connection fails,
+    also when it is tried again.
     """
     wanted: dict[str, Any] = {"robots": robots, "kinds": kinds, "live": live or {}}
     number: int | None = None
@@ -292,7 +305,7 @@ def follow(
                     number = change.number
                     yield change
         except UnreachableError:
-            if number is None:
+            if number is None and attempt:
                 raise
         time.sleep(_RECONNECT_PAUSES_S[min(attempt, len(_RECONNECT_PAUSES_S) - 1)])
         attempt += 1
@@ -323,7 +336,7 @@ def _raise_for(wire: ApiConnection, code: int, reason: str) -> None:
 
 def _connected(wire: ApiConnection) -> ClientConnection:
     try:
-        from websockets.exceptions import InvalidStatus
+        from websockets.exceptions import InvalidHandshake, InvalidStatus
         from websockets.sync.client import connect
     except ImportError:
         raise UsageError("the feed needs the package websockets", "pip install 'amberbox[link]'") \
@@ -340,6 +353,6 @@ def _connected(wire: ApiConnection) -> ClientConnection:
     except InvalidStatus as error:
         answer = error.response
         raise error_of(answer.status_code, answer.body or b"", wire.url) from error
-    except OSError as error:
-        why = error.strerror or str(error)
+    except (OSError, InvalidHandshake) as error:
+        why = getattr(error, "strerror", None) or str(error)
         raise UnreachableError(f"{wire.url} does not answer: {why}") from error

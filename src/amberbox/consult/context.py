@@ -7,18 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from amberbox.blackbox.query.record import LocalRecord
 from amberbox.blackbox.query.record_window import RecordWindow
+from amberbox.blackbox.robot_folder.folder import RobotFolder
 from amberbox.blackbox.store.store import Store
-from amberbox.consult.rule_lookups import record_predicates
+from amberbox.consult.folder_knowledge import load_knowledge
+from amberbox.consult.rule_lookups import ConditionCache, record_predicates
 from amberbox.core.clock import NS
 from amberbox.core.contracts import NOTHING_GIVEN, EvidenceNeeds, GivenEvidence
-from amberbox.core.errors import UsageError
+from amberbox.core.errors import Problem, UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.core.types import Diagnosis, Symptom
-from amberbox.diagnosis.diagnose import DiagnosisContext, ObservedSituation
+from amberbox.diagnosis.diagnose import DiagnosisContext, ObservedSituation, is_answer
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.prolog.machine import Virtual
 from amberbox.diagnosis.symptom_presence import AbsenceTimes, SymptomPresences
@@ -35,6 +38,7 @@ from amberbox.monitoring.plan import MonitoringPlan
 from amberbox.monitoring.record_evaluation import (
     WARM_UP_S,
     DiagnosedEngine,
+    MakeDiagnoser,
     RecordEvaluation,
     ReplayOptions,
     blocks,
@@ -64,31 +68,57 @@ class _RecordedFaults:
         return DiagnosisContext(at_ns, situation, self.diagnosis, seen=seen)
 
 
+def load_diagnoser(
+    folder: RobotFolder, plan: MonitoringPlan, store: Path | None = None
+) -> tuple[MakeDiagnoser | None, list[Problem]]:
+    """Return a maker of fault trackers for a folder; None without failure modes.
+
+    Its providers of evidence look at the record in a ``store``, the folder's own by default.
+    """
+    knowledge, problems = load_knowledge(folder, plan)
+    if knowledge is None:
+        return None, problems
+    open_window = followed_windows(folder.path, store or folder.store_path)
+    return partial(FaultTracker, knowledge, open_window), problems
+
+
 def context_at(
-    knowledge: Knowledge, plan: MonitoringPlan, store: Store, at_ns: int, lookback_s: float
+    knowledge: Knowledge,
+    plan: MonitoringPlan,
+    store: Store,
+    at_ns: int,
+    lookback_s: float,
+    folder: Path | None = None,
 ) -> DiagnosisContext:
     """Return the context at an instant: from the watcher's journal, else by evaluation.
 
-    Raises UsageError where nothing was recorded.
+    An evaluation asks providers of evidence if it has the robot's ``folder``. Raises UsageError
+    where nothing was recorded.
     """
     if was_watched(store, knowledge.config_hash, at_ns):
         found = context_from_journal(knowledge, store, at_ns)
         if found is not None:
             return found
-    return context_by_evaluation(knowledge, plan, store, at_ns, lookback_s)
+    return context_by_evaluation(knowledge, plan, store, at_ns, lookback_s, folder)
 
 
 def context_by_evaluation(
-    knowledge: Knowledge, plan: MonitoringPlan, store: Store, at_ns: int, lookback_s: float
+    knowledge: Knowledge,
+    plan: MonitoringPlan,
+    store: Store,
+    at_ns: int,
+    lookback_s: float,
+    folder: Path | None = None,
 ) -> DiagnosisContext:
     """Evaluate the record before an instant, and a minute before that; nothing is written.
 
     Raises UsageError where nothing was recorded.
     """
-    tracker, recorded = FaultTracker(knowledge), _RecordedFaults()
+    open_window = None if folder is None else followed_windows(folder, store.path)
+    tracker, recorded = FaultTracker(knowledge, open_window), _RecordedFaults()
     engine = DiagnosedEngine(Engine(plan), tracker)
     evaluation = RecordEvaluation(engine)
-    with hang_guard(plan):
+    with hang_guard(plan, engine.guarded):
         for block in _between(plan, store, engine, at_ns - round(lookback_s * NS), at_ns):
             for found in evaluation.take(block):
                 recorded.receive(found)
@@ -143,9 +173,16 @@ def context_from_findings(
     recorded.receive(findings.symptoms)
     recorded.receive(findings.diagnoses)
     symptoms = [*_from_deleted_files(recorded.diagnosis, findings.symptoms), *findings.symptoms]
-    return replace(
-        recorded.context(at_ns, situation_at(knowledge, symptoms, at_ns)), origin="watcher"
-    )
+    situation = situation_at(knowledge, symptoms, at_ns)
+    found = recorded.context(at_ns, situation)
+    if found.open is not None:
+        answers = {
+            given.test: given.answer
+            for given in findings.answers
+            if given.diagnosis == found.open.id and is_answer(knowledge, given.test, given.answer)
+        }
+        found = replace(found, situation=replace(situation, answers=answers))
+    return replace(found, origin="watcher")
 
 
 def _from_deleted_files(
@@ -180,7 +217,8 @@ class RobotWindow:
     """The ``EvidenceWindow`` of a robot at an instant (``core.contracts``).
 
     ``open_past`` opens a part of the record, by its first and last instant; None without a record.
-    The window reaches back as far as a provider needs, and at least ``lookback_ns``.
+    The window reaches back as far as a provider needs, and at least ``lookback_ns``. ``cache``
+    keeps what lookups have found for later windows of the same record.
     """
 
     context: DiagnosisContext
@@ -188,6 +226,7 @@ class RobotWindow:
     given: GivenEvidence = NOTHING_GIVEN
     open_past: Callable[[int, int], RecordWindow] | None = None
     lookback_ns: int = 0
+    cache: ConditionCache | None = None
 
     @property
     def at_ns(self) -> int:
@@ -209,4 +248,10 @@ class RobotWindow:
     def lookups(self, needs: EvidenceNeeds) -> Sequence[Virtual]:
         """Return the predicates of rules that query that part of the record."""
         past = self.past(needs)
-        return () if past is None else record_predicates(past)
+        return () if past is None else record_predicates(past, self.cache, self.context.statuses)
+
+
+def followed_windows(folder: Path, store: Path) -> Callable[[DiagnosisContext], RobotWindow]:
+    """Return a function that opens a robot's folder and record again and again as time passes."""
+    past = partial(RecordWindow, LocalRecord(store))
+    return partial(RobotWindow, folder=folder, open_past=past, cache=ConditionCache())

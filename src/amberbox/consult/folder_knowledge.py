@@ -9,31 +9,43 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from amberbox.blackbox.columns.variables import names_of
 from amberbox.blackbox.robot_folder.folder import RobotFolder, declared_folder
+from amberbox.consult.folder_runs import folder_runs, runs_of_copy
+from amberbox.core.contracts import ModeContract
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
+from amberbox.core.expression import parse
 from amberbox.core.expressions.tree import status_address
+from amberbox.core.mode import beyond_limits
 from amberbox.core.needs import Needs, all_of
+from amberbox.core.units import PER_SECOND, per_second
 from amberbox.core.yaml_nodes import only_below
 from amberbox.diagnosis.evidence.rules import rule_files, with_rules
 from amberbox.diagnosis.fmea.loader import FILE, load_fmea
-from amberbox.diagnosis.fmea.model import Fmea, FmeaReferences
+from amberbox.diagnosis.fmea.model import Fmea, FmeaReferences, SymptomMeasure
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.prolog.program import read_rules
-from amberbox.monitoring.plan import ComponentPlan, MonitoringPlan
+from amberbox.monitoring.plan import (
+    ComponentPlan,
+    MappingPlan,
+    ModePlan,
+    MonitoringPlan,
+    OutputPlan,
+    measured_from,
+)
 from amberbox.monitoring.plan_loader import load_plan
 from amberbox.monitoring.recorded_items import RecordedItems
-
-if TYPE_CHECKING:
-    from amberbox.monitoring.record_evaluation import MakeDiagnoser
 
 
 def fmea_references(folder: RobotFolder, plan: MonitoringPlan | None = None) -> FmeaReferences:
     """Return the outputs of a folder's monitors, its components' needs, and the recorded items."""
     plan = plan or load_plan(folder)[0]
-    known, variables = declared_references(folder, plan), _variables(RecordedItems(folder))
+    recorded = RecordedItems(folder)
+    declared, variables = declared_references(folder, plan), _variables(recorded)
+    runs = partial(folder_runs, folder.path)
+    units = _units(recorded)
+    known = replace(declared, runs=runs, units={**units, **_output_units(plan, units)})
     return (
         known
         if variables is None
@@ -49,8 +61,13 @@ def monitor_addresses(plan: MonitoringPlan) -> frozenset[str]:
 
 
 def declared_references(folder: RobotFolder, plan: MonitoringPlan) -> FmeaReferences:
-    """Return the same without recorded variables; conditions may then read any variable."""
-    return with_rules(plan_references(plan), folder.path)
+    """Return the same without recorded variables and unit tests: conditions and tests may then
+    name any.
+    """
+    known = replace(plan_references(plan), runs=partial(runs_of_copy, folder.path))
+    if folder.robot.detection is not None:
+        known = replace(known, detected=detected_references(plan))
+    return with_rules(known, folder.path)
 
 
 def _variables(recorded: RecordedItems) -> list[str] | None:
@@ -59,6 +76,32 @@ def _variables(recorded: RecordedItems) -> list[str] | None:
     if recorded.open or None in schemas.values():
         return None
     return [f"{name}.{of}" for name, schema in schemas.items() if schema for of in names_of(schema)]
+
+
+def _units(recorded: RecordedItems) -> dict[str, str]:
+    """Return the units of all variables whose messages are known and state one."""
+    schemas = {item.name: recorded.schema(item) for item in recorded.items}
+    return {
+        f"{name}.{column.name}": column.unit
+        for name, schema in schemas.items()
+        for column in (schema.columns if schema else ())
+        if column.unit
+    }
+
+
+def _output_units(plan: MonitoringPlan, units: Mapping[str, str]) -> dict[str, str]:
+    """Return the units of outputs that are numbers; ``1/s`` is that of the input per second."""
+    found: dict[str, str] = {}
+    for component, mode in plan.modes():
+        for mapping in mode.mappings:
+            for output in mapping.outputs:
+                unit = "" if output.type == "bool" else output.result.unit
+                if unit == PER_SECOND:
+                    own = {units.get(one, "") for one in measured_from(mapping, output)}
+                    unit = per_second(own.pop()) if len(own) == 1 and "" not in own else ""
+                if unit:
+                    found[f"{component.id}/{mode.id}/{output.name}"] = unit
+    return found
 
 
 def plan_references(plan: MonitoringPlan) -> FmeaReferences:
@@ -76,7 +119,72 @@ def plan_references(plan: MonitoringPlan) -> FmeaReferences:
     ids |= {component.id: component.id for component in plan.components}
     needs = {component.id: _needs(component, ids) for component in plan.components}
     files = {component.id: component.file for component in plan.components if component.modes}
-    return FmeaReferences(frozenset(outputs), frozenset(watched), needs, files=files)
+    return FmeaReferences(
+        frozenset(outputs), frozenset(watched), needs, files=files, measures=_measures(plan),
+        units=_output_units(plan, {}),
+    )  # fmt: skip
+
+
+def detected_references(plan: MonitoringPlan) -> dict[str, list[str]]:
+    """Return per output of a plan the addresses that it is measured from."""
+    return {
+        f"{component.id}/{mode.id}/{output.name}": measured_from(mapping, output)
+        for component, mode in plan.modes()
+        for mapping in mode.mappings
+        for output in mapping.outputs
+    }
+
+
+def _measures(plan: MonitoringPlan) -> dict[str, SymptomMeasure]:
+    """Return how large a bad output is, where its mode or its expected number says so."""
+    found: dict[str, SymptomMeasure] = {}
+    for component, mode in plan.modes():
+        for mapping in mode.mappings:
+            for output in mapping.outputs:
+                address = f"{component.id}/{mode.id}/{output.name}"
+                text = _measure_text(address, mode, mapping, output)
+                if text:
+                    found[address] = SymptomMeasure(parse(text))
+    return found
+
+
+def _measure_text(address: str, mode: ModePlan, mapping: MappingPlan, output: OutputPlan) -> str:
+    expected = output.expectation
+    if isinstance(expected.value, int | float) and not isinstance(expected.value, bool):
+        high = expected.high if expected.relation == "within" else None
+        low = float(expected.value)
+        return (
+            ""
+            if expected.relation == "!="
+            else beyond_limits(f"`{address}`", low, low if high is None else high)
+        )
+    stated = getattr(mode.module, "measure", None)
+    if stated is None or output.type != "bool" or expected.value is not True:
+        return ""
+    inputs = measured_from(replace(mapping, reads=()), output)
+    if any(one.kind in ("probe", "list") for one in mapping.inputs):
+        return ""
+    text: str = stated(mode.config, output.result.name, [_quoted(one) for one in inputs])
+    results = _results(mode, mapping)
+    if text not in results:
+        return text
+    place = address.rpartition("/")[0]
+    shown = (one.name for one in mapping.outputs if one.result.name == text)
+    return next((f"`{place}/{name}`" for name in shown), "")
+
+
+def _results(mode: ModePlan, mapping: MappingPlan) -> list[str]:
+    """Return the names of all results of a mapping."""
+    contract = ModeContract.of(mode.module)
+    if contract.results_of is None:
+        return [result.name for result in contract.results]
+    bools = sum(output.type == "bool" for output in mapping.outputs)
+    return [r.name for r in contract.results_of(mode.config, len(mapping.inputs), bools)]
+
+
+def _quoted(address: str) -> str:
+    """Return an address as an expression has it: an item alone is in backticks."""
+    return address if "." in address else f"`{address}`"
 
 
 def _needs(component: ComponentPlan, ids: Mapping[str, str]) -> Needs:
@@ -149,7 +257,7 @@ def read_declared_robot(place: Path, robot: str, config_hash: str) -> DeclaredRo
     """Read a copy of a robot's folder: only declarative files, and only files inside it."""
     with only_below(place):
         folder, plan = read_declared_plan(place, robot, config_hash)
-        known = declared_references(folder, plan)
+        known = replace(declared_references(folder, plan), measures=None)
         path = place / FILE
         fmea, problems = load_fmea(path, known) if path.is_file() else (None, [])
     return DeclaredRobot(folder, plan, known, fmea, problems)
@@ -176,16 +284,6 @@ def load_knowledge(
     if fmea is None:
         return None, problems
     return Knowledge(folder.robot.id, fmea, plan.config_hash, exposure_h), problems
-
-
-def load_diagnoser(
-    folder: RobotFolder, plan: MonitoringPlan
-) -> tuple[MakeDiagnoser | None, list[Problem]]:
-    """Return a maker of fault trackers for a folder; None without failure modes."""
-    from amberbox.diagnosis.tracker import FaultTracker
-
-    knowledge, problems = load_knowledge(folder, plan)
-    return (None if knowledge is None else partial(FaultTracker, knowledge)), problems
 
 
 def rule_problems(folder: RobotFolder) -> list[Problem]:

@@ -6,7 +6,7 @@ Lookups find conditions (``holds/3``), missions, and statuses reported by the wa
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -42,10 +42,12 @@ from amberbox.diagnosis.prolog.machine import LookupSource, Virtual
 from amberbox.diagnosis.prolog.program import Interval, Intervals, Keys
 from amberbox.diagnosis.prolog.syntax import write
 from amberbox.diagnosis.prolog.terms import RuleFault, Term, TextTerm, make, to_term
+from amberbox.diagnosis.status_history import RecentStatuses
 from amberbox.monitoring.current_state import SILENT_NS
 from amberbox.monitoring.findings import COMPONENT_STATE, HealthState
 
 _BLOCK_NS = 900 * NS
+_LATE_NS = 5 * NS
 _MOST_BLOCKS = 16
 """Number of adjacent blocks that are read together."""
 _LOOKBACKS_NS = (60 * NS, 3600 * NS)
@@ -72,11 +74,40 @@ class _Question:
     known: dict[int, list[Span]]
 
 
-class ConditionLookup:
-    """Looks up when conditions were true; results are cached."""
+@dataclass(slots=True)
+class ConditionCache:
+    """When conditions were true in blocks of time that are over, for later looks at a record.
 
-    def __init__(self, window: RecordWindow) -> None:
+    It is emptied when the runs of the record begin elsewhere: then clocks are known better.
+    """
+
+    runs: tuple[int, ...] = ()
+    known: dict[str, dict[int, list[Span]]] = field(default_factory=dict)
+    reached_ns: dict[str, int] = field(default_factory=dict)
+
+    def of(self, window: RecordWindow, condition: str) -> dict[int, list[Span]]:
+        """Return the blocks of a condition that were over when they were looked at."""
+        runs = tuple(first for first, _ in window.recorded)
+        if runs[: len(self.runs)] != self.runs:
+            self.known.clear()
+        self.runs = runs
+        first_ns, last_ns = window.span
+        over_ns = self.reached_ns.get(condition, 0)
+        self.reached_ns[condition] = last_ns
+        self.known[condition] = {
+            block: spans
+            for block, spans in self.known.get(condition, {}).items()
+            if block >= first_ns // _BLOCK_NS and (block + 1) * _BLOCK_NS <= over_ns
+        }
+        return self.known[condition]
+
+
+class ConditionLookup:
+    """Looks up when conditions were true; results are cached, with a cache for later ones too."""
+
+    def __init__(self, window: RecordWindow, cache: ConditionCache | None = None) -> None:
         self._window = window
+        self._cache = cache or ConditionCache()
         self._questions: dict[str, _Question] = {}
 
     def find(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
@@ -102,16 +133,16 @@ class ConditionLookup:
         text = given if isinstance(given, str) else given.value
         if text not in self._questions:
             try:
-                self._questions[text] = self._made(parse(text))
+                self._questions[text] = self._made(parse(text), self._cache.of(self._window, text))
             except AmberboxError as error:
                 raise RuleFault(f"condition '{text}': {error.what}", error.hint) from error
         return self._questions[text]
 
-    def _made(self, when: Expression) -> _Question:
+    def _made(self, when: Expression, known: dict[int, list[Span]]) -> _Question:
         problem = condition_problem(when)
         if problem:
             raise UsageError(problem, "docs/reference/expressions.md describes conditions")
-        return _Question(when, tuple(map(self._read, when.addresses())), {})
+        return _Question(when, tuple(map(self._read, when.addresses())), known)
 
     def _read(self, address: str) -> _Read:
         item, _, variable = address.partition(".")
@@ -127,7 +158,10 @@ class ConditionLookup:
         missing = [block for block in blocks if block not in question.known]
         for start, count in _intervals(missing):
             self._look(question, start, count)
-        yield from join_spans(found for block in blocks for found in question.known[block])
+        for since, until in join_spans(f for block in blocks for f in question.known[block]):
+            cut = self._window.cut((since, until))  # earlier looks may have reached further back
+            if cut[0] < cut[1]:
+                yield cut
 
     def _look(self, question: _Question, start: int, count: int) -> None:
         """Evaluate some blocks, and cache when the condition held in each."""
@@ -220,14 +254,29 @@ _FIRST_NS = (3 * NS, 60 * NS)
 
 @dataclass(frozen=True)
 class MissionLookup:
-    """The missions of a record."""
+    """The missions of a record.
+
+    What began or ended in the last ``late_ns`` of the window is not known yet, as its record may
+    be written so late.
+    """
 
     window: RecordWindow
+    late_ns: int = 0
 
     @cached_property
     def known(self) -> list[RecordedMission]:
-        """Return all missions that overlap the window."""
-        return choose(self.window.missions(), span=self.window.span)
+        """Return all missions that overlap the window; one that ends after it still lasts."""
+        first, last = self.window.span
+        end = self.window.to_ns
+        if end is not None:
+            end -= self.late_ns
+            last = min(last, end)
+        return [
+            mission
+            if mission.to_ns is None or end is None or mission.to_ns <= end
+            else replace(mission, end=None, outcome="", failed=False)
+            for mission in choose(self.window.missions(), span=(first, last))
+        ]
 
     def find(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
         """Yield missions with each of their outcomes."""
@@ -279,15 +328,35 @@ class _ConditionInterval:
 
 @dataclass(frozen=True)
 class StatusLookup:
-    """Statuses of components as the watcher reported them, from change to change."""
+    """Statuses of components as the watcher reported them, from change to change.
+
+    ``recent`` are those that a watcher knows without having written them all.
+    """
 
     window: RecordWindow
+    recent: RecentStatuses | None = None
 
     @cached_property
     def intervals(self) -> list[_ConditionInterval]:
         """Return conditions of components in order of time, run by run of the watcher."""
-        runs = (self.window.cut(run) for run in self._watched())
-        return [one for run in runs if run[0] < run[1] for one in self._in_run(run)]
+        return [*self._written(), *self.known]
+
+    @cached_property
+    def known(self) -> list[_ConditionInterval]:
+        """Return the recent ones."""
+        return [
+            _ConditionInterval(one.component, HealthState(one.level, one.state), one[3:])
+            for one in (() if self.recent is None else self.recent.spans)
+        ]
+
+    def _written(self) -> Iterator[_ConditionInterval]:
+        """Yield those of the watcher's journal, up to the recent ones."""
+        last = self.window.span[1]
+        end = last if self.recent is None else min(last, self.recent.from_ns)
+        for run in map(self.window.cut, self._watched()):
+            until = min(run[1], end)
+            if run[0] < until:
+                yield from self._in_run((run[0], until))
 
     def _watched(self) -> Iterator[Span]:
         """Yield the watcher's runs; each counts until its silence would be noticed.
@@ -301,15 +370,19 @@ class StatusLookup:
 
     def levels(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
         """Yield the levels of components: ok, warn, error, stale, unknown."""
-        return self._find(keys, lambda condition: condition.level)
+        return self._find(keys, span, lambda condition: condition.level)
 
     def states(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
         """Yield the states of components: nominal, not_initialised, a fault state."""
-        return self._find(keys, lambda condition: condition.state)
+        return self._find(keys, span, lambda condition: condition.state)
 
-    def _find(self, keys: Keys, word: Callable[[HealthState], str]) -> Iterator[Interval]:
+    def _find(
+        self, keys: Keys, span: Span | None, word: Callable[[HealthState], str]
+    ) -> Iterator[Interval]:
         component, wanted = keys
-        found = (s for s in self.intervals if component is None or s.component == component)
+        is_recent = span is not None and self.recent is not None and span[0] >= self.recent.from_ns
+        intervals = self.known if is_recent else self.intervals
+        found = (s for s in intervals if component is None or s.component == component)
         for name, text, span in _joined((s.component, word(s.condition), s.span) for s in found):
             if wanted is None or wanted == text:
                 source = LookupSource(f"watcher, {in_words(span)}", ((name, *span),))
@@ -410,12 +483,20 @@ def rule_target(where: str) -> RuleTarget:
     return RuleTarget(path, folder, fmea)
 
 
-def record_predicates(window: RecordWindow) -> list[Virtual]:
-    """Return the predicates that query a record."""
+def record_predicates(
+    window: RecordWindow,
+    cache: ConditionCache | None = None,
+    recent: RecentStatuses | None = None,
+) -> list[Virtual]:
+    """Return the predicates that query a record.
+
+    While it is followed, the ``cache`` keeps what is over for later queries, and ``recent`` are the
+    latest statuses.
+    """
     missions, statuses, conditions = (
-        MissionLookup(window),
-        StatusLookup(window),
-        ConditionLookup(window),
+        MissionLookup(window, 0 if cache is None else _LATE_NS),
+        StatusLookup(window, recent),
+        ConditionLookup(window, cache),
     )
     text, condition = window.read_time, (frozenset({1}),)
     hint = "say which condition: holds('sim_battery.charge < 20', From, To)"

@@ -6,15 +6,19 @@ rest are options of the action's kind (``experiments/actions/KIND.py``).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, NoReturn, TypeAlias
+from typing import Annotated, Any, Literal, NoReturn, Protocol, TypeAlias
+
+import msgspec
+from msgspec import Meta
 
 from amberbox.core.command import Risk
 from amberbox.core.config import Finding, build, field_keys
@@ -47,7 +51,10 @@ _INT_64 = 2**63
 _ACTION_NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}")
 _PARAMETER_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
+_YES_NO = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+
 Value: TypeAlias = bool | int | float | str
+_Text: TypeAlias = Annotated[str, Meta(max_length=LONGEST_TEXT)]
 
 
 @dataclass(frozen=True)
@@ -408,23 +415,181 @@ def _is_below(where: str, name: str) -> bool:
     return where.startswith(f"{name}.")
 
 
-def announcement(folder: Path) -> str:
+def announcement(
+    folder: Path,
+    recovers: Mapping[str, Sequence[str]] | None = None,
+    most_bytes: int | None = None,
+) -> str:
     """Return all actions of a folder without errors, for servers, as JSON text.
 
     It holds names, descriptions, risks, timeouts and parameters with limits; no addresses, no code.
+    ``recovers`` are the causes (components, failure modes) against which an action may help.
+    Actions that do not fit into ``most_bytes`` are left out; ``left_out`` counts them.
     """
     found, _ = read_actions(folder)
-    actions = [found[name].announced() for name in sorted(found)]
-    return json.dumps({"actions": actions}, ensure_ascii=False, allow_nan=False)
+    actions, size, left_out = [], _ANNOUNCEMENT_BYTES, 0
+    for name in sorted(found):
+        action = found[name].announced() | {"recovers": list((recovers or {}).get(name, ()))}
+        more = len(_json(action).encode()) + 2
+        if most_bytes is not None and size + more > most_bytes:
+            left_out += 1
+        else:
+            actions.append(action)
+            size += more
+    why = {"left_out": left_out, "reason": f"an announcement has at most {most_bytes} bytes"}
+    return _json({"actions": actions, **(why if left_out else {})})
 
 
-def check_parameters(declared: DeclaredAction, text: str) -> dict[str, Value]:
+# Of an announcement without actions
+_ANNOUNCEMENT_BYTES = 200
+
+
+def _json(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+@dataclass(frozen=True)
+class AnnouncedAction:
+    """What a server knows of an action of a robot.
+
+    ``recovers`` names failure modes that it is a remedy of, as the robot says.
+    """
+
+    name: str
+    risk: Risk
+    description: str = ""
+    timeout_s: float = 30.0
+    simulated: bool = False
+    parameters: Mapping[str, ParameterOptions] = field(default_factory=dict)
+    recovers: Sequence[str] = ()
+
+
+class _ParameterJson(msgspec.Struct):
+    type: Literal["bool", "int", "float", "string"]
+    unit: _Text = ""
+    min: float | None = None
+    max: float | None = None
+    choices: Annotated[list[bool | int | float | str], Meta(max_length=MOST_CHOICES)] = []
+    default: bool | int | float | str | None = None
+    max_length: int | None = None
+    description: _Text = ""
+
+
+class _ActionJson(msgspec.Struct):
+    name: Annotated[str, Meta(pattern=r"\A[A-Za-z0-9_.-]{1,64}\Z")]
+    risk: Risk
+    description: _Text = ""
+    timeout_s: Annotated[float, Meta(ge=0, le=LONGEST_TIMEOUT_S)] = 30.0
+    simulated: bool = False
+    parameters: Annotated[dict[str, _ParameterJson], Meta(max_length=MOST_PARAMETERS)] = {}
+    recovers: Annotated[list[_Text], Meta(max_length=MOST_ACTIONS)] = []
+
+
+class _AnnouncementJson(msgspec.Struct):
+    actions: list[msgspec.Raw] = []
+    tests: list[msgspec.Raw] = []
+    left_out: int = 0
+
+
+def read_announcement(text: str | bytes) -> tuple[dict[str, AnnouncedAction], int]:
+    """Return the actions by name that a robot has announced, and how many are left out.
+
+    The robot wrote the text: what has not the form of an announced action is left out. Unit tests
+    of the robot are actions with the prefix ``test.``.
+    """
+    try:
+        said = msgspec.json.decode(text, type=_AnnouncementJson)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return {}, 0
+    entries = [("", raw) for raw in said.actions] + [("test.", raw) for raw in said.tests]
+    found: dict[str, AnnouncedAction] = {}
+    for prefix, raw in entries[: 2 * MOST_ACTIONS]:
+        with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
+            action = _announced(prefix, msgspec.json.decode(raw, type=_ActionJson))
+            found.setdefault(action.name, action)
+    return found, max(said.left_out, 0) + len(entries) - len(found)
+
+
+def _announced(prefix: str, said: _ActionJson) -> AnnouncedAction:
+    """Return an announced action; raises ValueError for one that no folder can declare."""
+    parameters = {}
+    for name, one in said.parameters.items():
+        is_text = one.type == "string" and one.max_length is not None
+        parameter = ParameterOptions(
+            one.type, one.unit, one.min, one.max, tuple(one.choices), one.default,
+            one.max_length or 0 if is_text else 100, one.description,
+        )  # fmt: skip
+        if not _PARAMETER_NAME.fullmatch(name) or any(parameter.check()):
+            raise ValueError(f"the parameter {_shown(name)} is not one")
+        parameters[name] = parameter
+    for text in (said.description, *said.recovers):
+        if any(_unfit("", text)):
+            raise ValueError("a text is not one for people")
+    return AnnouncedAction(
+        prefix + said.name, said.risk, said.description, said.timeout_s, said.simulated,
+        parameters, tuple(said.recovers),
+    )  # fmt: skip
+
+
+class HasParameters(Protocol):
+    """What has parameters: an action, or an experiment."""
+
+    @property
+    def parameters(self) -> Mapping[str, ParameterOptions]:
+        """Return its parameters by name."""
+
+
+def parameters_of_words(declared: HasParameters, words: Sequence[str]) -> dict[str, Any]:
+    """Return the values in words ``NAME=VALUE``; ``check_parameters`` judges them.
+
+    Raises UsageError for other words, and for a name that is given twice.
+    """
+    return values_of_words({name: one.kind for name, one in declared.parameters.items()}, words)
+
+
+def values_of_words(kinds: Mapping[str, str], words: Sequence[str]) -> dict[str, Any]:
+    """Return the values in words ``NAME=VALUE``, by the kinds of parameters.
+
+    ``accept_values`` judges them. Raises UsageError for other words, and for a name that is given
+    twice.
+    """
+    found: dict[str, Any] = {}
+    for word in words:
+        name, is_given, value = word.partition("=")
+        if not is_given:
+            raise UsageError(f"'{word}' is no parameter", "write it as distance_m=0.5")
+        if name in found:
+            raise UsageError(f"'{name}' is given twice", "each parameter has one value")
+        found[name] = _value_of_word(kinds[name], value) if name in kinds else value
+    return found
+
+
+def _value_of_word(kind: str, text: str) -> Any:
+    if kind == "bool":
+        return _YES_NO.get(text.lower(), text)
+    if kind != "string":
+        with contextlib.suppress(ValueError):
+            return int(text)
+        with contextlib.suppress(ValueError):
+            return float(text)
+    return text
+
+
+def check_parameters(action: DeclaredAction | AnnouncedAction, text: str) -> dict[str, Value]:
     """Return the values of all parameters, from the JSON text of an object.
 
     Defaults are filled in. Raises UsageError that names everything that is wrong.
     """
-    given = _object(text)
-    known = declared.parameters
+    return accept_values(action.parameters, _object(text), action.name)
+
+
+def accept_values(
+    known: Mapping[str, ParameterOptions], given: Mapping[str, Any], whose: str
+) -> dict[str, Value]:
+    """Return the values of all parameters, from those given; defaults are filled in.
+
+    Raises UsageError that names everything that is wrong.
+    """
     values: dict[str, Value] = {}
     wrong = [
         f"there is no parameter {_shown(key)}{did_you_mean(key, known)}"
@@ -441,7 +606,7 @@ def check_parameters(declared: DeclaredAction, text: str) -> dict[str, Value]:
             wrong.append(f"{name}: {error}")
     if wrong:
         names = ", ".join(known) if known else "none"
-        raise UsageError("; ".join(wrong), f"parameters of {declared.name}: {names}")
+        raise UsageError("; ".join(wrong), f"parameters of {whose}: {names}")
     return values
 
 

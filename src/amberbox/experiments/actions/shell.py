@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import shutil
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from amberbox.core.errors import AmberboxError, NotStartedError
+from amberbox.core.files import wait_readable
 from amberbox.core.options import option
 from amberbox.experiments.actions import _placeholders
 
@@ -158,7 +158,7 @@ class _Output:
 
     def read(self, within_s: float) -> None:
         """Read what is there, or wait a moment for it."""
-        select.select([self._fd] if self._open else [], [], [], within_s)
+        wait_readable([self._fd] if self._open else [], within_s)
         for _ in range(64):  # at most 4 MB at once: then others have their turn
             try:
                 block = os.read(self._fd, 1 << 16)
