@@ -12,33 +12,22 @@ from sqlalchemy import Connection, Row, func, select, update
 
 from amberbox.blackbox.retention.missions import FAILED, SUPERSEDED, MissionInstant, RecordedMission
 from amberbox.core.errors import UsageError
+from amberbox.core.notes import RecordedNote
+from amberbox.core.record_commands import NoteWrite
+from amberbox.server import record_orders
 from amberbox.server.database import ServerDatabase
 from amberbox.server.schema import INCIDENT, MISSION, MISSION_NOTE
 
-# The mission id of an annotation of a moment alone; no mission has this id
-NO_MISSION = ""
 # Largest number of missions, incidents or annotations that people may add per robot
 _MOST = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class MissionAnnotation:
-    """A remark on a mission."""
-
-    at_ns: int
-    who: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class MomentAnnotation:
-    """A remark on a moment; ``mission`` is ``NO_MISSION`` where it is on none."""
+class StoredNote:
+    """A note on a moment or a mission; ``number`` is its place among all of the server."""
 
     number: int
-    at_ns: int
-    who: str
-    text: str
-    mission: str
+    note: RecordedNote
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,27 +92,96 @@ def end(
     return _found(connection, robot, mission_id)
 
 
-def annotate(
-    connection: Connection, now_ns: int, robot: str, mission_id: str, who: str, text: str
-) -> MomentAnnotation:
-    """Add an annotation to a mission (of people or of the robot) or to a moment."""
+def annotate(connection: Connection, robot: str, note: RecordedNote) -> StoredNote:
+    """Add a note to a mission (of people or of the robot) or to a moment.
+
+    Raises UsageError when a robot has too many.
+    """
     _refuse_too_many(connection, MISSION_NOTE, robot)
-    row = {"robot": robot, "mission": mission_id, "at_ns": now_ns, "who": who, "text": text}
+    row = {"robot": robot, "uid": note.id} | {name: getattr(note, name) for name in _NOTE_FIELDS}
     made = connection.execute(MISSION_NOTE.insert().returning(MISSION_NOTE.c.number), row)
-    return MomentAnnotation(made.scalar_one(), now_ns, who, text, mission_id)
+    return StoredNote(made.scalar_one(), note)
+
+
+def find_note(connection: Connection, robot: str, uid: str) -> StoredNote | None:
+    """Return a note by the id that robot and server share; None if there is none."""
+    chosen = select(MISSION_NOTE).where(MISSION_NOTE.c.robot == robot, MISSION_NOTE.c.uid == uid)
+    row = connection.execute(chosen).first()
+    return None if row is None else _stored(row)
+
+
+def change_note(connection: Connection, robot: str, note: RecordedNote) -> None:
+    """Store a later revision of a note; its times remain."""
+    values = {name: getattr(note, name) for name in _CHANGED}
+    chosen = update(MISSION_NOTE).where(
+        MISSION_NOTE.c.robot == robot, MISSION_NOTE.c.uid == note.id
+    )
+    connection.execute(chosen.values(**values))
+
+
+def take_note(connection: Connection, robot: str, note: RecordedNote) -> bool:
+    """Take a note from a robot's record; return whether it is new here, or changed.
+
+    The note of a command that comes back is no news, nor is an older revision.
+    """
+    about = note_matter(note.id)
+    known = find_note(connection, robot, note.id)
+    if known is not None and known.note.rank >= note.rank:
+        sent = record_orders.find(connection, robot, about)
+        if sent is not None and known.note.rank == note.rank:
+            record_orders.see(connection, robot, about, sent.command)
+        return False
+    note = msgspec.structs.replace(note, who=f"{note.who or 'somebody'} at the robot"[:200])
+    if known is not None:
+        change_note(connection, robot, note)
+    elif note.withdrawn:
+        return False
+    else:
+        try:
+            annotate(connection, robot, note)
+        except UsageError:  # a robot that writes notes without end
+            return False
+    return True
+
+
+def send_note(connection: Connection, now_ns: int, robot: str, note: RecordedNote) -> bool:
+    """Let a robot write a note into its record, too; return whether a command was made.
+
+    The caller publishes ``command`` for the robot after the transaction.
+    """
+    wanted = NoteWrite(**msgspec.structs.asdict(note))
+    matter = note_matter(note.id)
+    return record_orders.order(connection, now_ns, robot, matter, wanted, note.who)
+
+
+def note_matter(uid: str) -> str:
+    """Return the matter of the orders that concern a note."""
+    return f"note:{uid}"
+
+
+_NOTE_FIELDS = (
+    "at_ns", "to_ns", "who", "text", "about", "mission", "revision", "withdrawn", "written_ns",
+)  # fmt: skip
+_CHANGED = ("who", "text", "revision", "withdrawn", "written_ns")
+
+
+def _stored(row: Row[Any]) -> StoredNote:
+    values = {name: getattr(row, name) for name in _NOTE_FIELDS}
+    return StoredNote(row.number, RecordedNote(row.uid, **values))
 
 
 def moment_annotations(
     connection: Connection, robot: str, span: tuple[int | None, int | None], after: int | None,
     limit: int,
-) -> list[MomentAnnotation]:  # fmt: skip
-    """Return at most ``limit`` annotations in ``[from, to)``, newest first, older than number
-    ``after``.
+) -> list[StoredNote]:  # fmt: skip
+    """Return at most ``limit`` notes in ``[from, to)``, newest first, older than number ``after``.
+
+    Those that are withdrawn are left out.
     """
     of, (from_ns, to_ns) = MISSION_NOTE.c, span
-    chosen = select(MISSION_NOTE).where(of.robot == robot)
+    chosen = select(MISSION_NOTE).where(of.robot == robot, of.withdrawn.is_(False))
     if from_ns is not None:
-        chosen = chosen.where(of.at_ns >= from_ns)
+        chosen = chosen.where(func.coalesce(of.to_ns - 1, of.at_ns) >= from_ns)
     if to_ns is not None:
         chosen = chosen.where(of.at_ns < to_ns)
     last_ns = connection.scalar(select(of.at_ns).where(of.robot == robot, of.number == after))
@@ -131,19 +189,20 @@ def moment_annotations(
         same = (of.at_ns == last_ns) & (of.number < after)
         chosen = chosen.where((of.at_ns < last_ns) | same)
     rows = connection.execute(chosen.order_by(of.at_ns.desc(), of.number.desc()).limit(limit))
-    return [MomentAnnotation(row.number, row.at_ns, row.who, row.text, row.mission) for row in rows]
+    return [_stored(row) for row in rows]
 
 
 def mission_annotations(
     connection: Connection, robot: str, mission_ids: Sequence[str]
-) -> dict[str, list[MissionAnnotation]]:
-    """Return the annotations of missions by mission id, oldest first."""
+) -> dict[str, list[RecordedNote]]:
+    """Return the notes on missions by mission id, oldest first."""
+    of = MISSION_NOTE.c
     chosen = select(MISSION_NOTE).where(
-        MISSION_NOTE.c.robot == robot, MISSION_NOTE.c.mission.in_(mission_ids)
+        of.robot == robot, of.mission.in_(mission_ids), of.withdrawn.is_(False)
     )
-    found: dict[str, list[MissionAnnotation]] = {}
-    for row in connection.execute(chosen.order_by(MISSION_NOTE.c.number)):
-        found.setdefault(row.mission, []).append(MissionAnnotation(row.at_ns, row.who, row.text))
+    found: dict[str, list[RecordedNote]] = {}
+    for row in connection.execute(chosen.order_by(of.number)):
+        found.setdefault(row.mission, []).append(_stored(row).note)
     return found
 
 

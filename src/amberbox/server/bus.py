@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeAlias, get_args
 Kind: TypeAlias = Literal[
     "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "fetch",
     "account", "diagnosis", "explained", "has", "holdings", "command", "answered",
+    "lease", "run",
 ]  # fmt: skip
 """What a change is about.
 
@@ -23,8 +24,10 @@ another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``fetch`` (data
 ``explained``: a diagnosis was put into words (data: answer, as ``POST .../diagnose`` gives it).
 ``has``: a robot told which journals hold a window (data: store_id, id, files).
 ``holdings``: a robot asked which of its journals are here, to send again those that are not.
-``command``: one was made for a robot, or, without a robot, a person's key was revoked.
-``answered``: a robot answered commands (data: ids).
+``command``: some were made for a robot or changed by people (data: ids), or, without a robot, a
+person's key was revoked. ``answered``: a robot answered commands (data: ids). ``lease``: a robot
+has another holder, or another motion waits for its confirmation (data: ids of such motions).
+``run``: a run of an experiment has begun, changed or ended (data: id).
 """
 
 KINDS = frozenset(get_args(Kind))

@@ -9,22 +9,27 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final
 
 import msgspec
 from sqlalchemy import Connection, Row, func, or_, select, update
 
+from amberbox.core.api import CommandState
 from amberbox.core.clock import NS
 from amberbox.core.command import (
+    MODEL_INSTALL,
     MOST_TTL_S,
     AnswerState,
     Command,
     CommandAnswer,
     CommandError,
+    CommandSignature,
     LeaseState,
     Risk,
+    decode_command,
     encode_command,
 )
 from amberbox.core.errors import UsageError
@@ -40,9 +45,9 @@ from amberbox.server.schema import (
     ROBOT,
 )
 
-CommandState: TypeAlias = Literal["waiting", "sent"] | AnswerState
-# States without an answer
+# States of a command that is sent until it is answered, and of one that may still be
 UNANSWERED: Final[Sequence[CommandState]] = ("waiting", "sent")
+OPEN: Final[Sequence[CommandState]] = ("unsigned", *UNANSWERED)
 # Longest time that a command waits for its robot
 LONGEST_DAYS: Final = 90
 LONGEST_NS: Final = LONGEST_DAYS * 24 * 3600 * NS
@@ -50,9 +55,14 @@ LONGEST_NS: Final = LONGEST_DAYS * 24 * 3600 * NS
 RESEND_NS: Final = 10 * NS
 # Largest number of unanswered commands per robot
 MOST_OPEN: Final = 1000
+# Answers to one command that are stored; later ones change its state only
+MOST_ANSWERS: Final = 50
+# Commands that this server does not know whose answers are stored, per robot
+MOST_UNKNOWN: Final = 1000
 
 # What is said of a command that expired in this state
 _EXPIRED: Final[Mapping[str, str]] = {
+    "unsigned": "it expired before anybody signed it",
     "waiting": "it expired before the robot was there",
     "sent": "it expired without an answer: the robot may have received it",
 }
@@ -60,7 +70,10 @@ _EXPIRED: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class ReceivedAnswer:
-    """One answer of a robot; ``at_ns`` by its clock, ``received_ns`` by the server's."""
+    """One answer of a robot; ``at_ns`` by its clock, ``received_ns`` by the server's.
+
+    ``mono_ns`` counts from the robot's ``boot``, and never steps.
+    """
 
     number: int
     state: AnswerState
@@ -68,6 +81,8 @@ class ReceivedAnswer:
     result: str
     at_ns: int
     received_ns: int
+    boot: str = ""
+    mono_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,22 +161,62 @@ def create(
     known = _same_id(connection, now_ns, command)
     if known is not None:
         return known
+    _check_signature(connection, now_ns, command, challenges)
+    if command.signature is not None:
+        lifetime_ns = min(lifetime_ns, command.signature.ttl_s * NS)
+    return _store(connection, now_ns, command, lifetime_ns, "waiting")
+
+
+def models_to_install(connection: Connection, robot: str) -> set[str]:
+    """Return the SHA-256 of the models that commands which a robot carries out now install."""
+    chosen = select(COMMAND.c.parameters).where(
+        COMMAND.c.robot == robot, COMMAND.c.action == MODEL_INSTALL,
+        COMMAND.c.state.in_(("sent", "accepted")),
+    )  # fmt: skip
+    texts = connection.execute(chosen).scalars()
+    return {str(msgspec.json.decode(text).get("sha256", "")) for text in texts}
+
+
+def model_takers(connection: Connection) -> set[str]:
+    """Return the robots that have announced that they install models."""
+    announced = COMMAND_ROBOT.c.actions.contains(f'"{MODEL_INSTALL}"')
+    return set(connection.execute(select(COMMAND_ROBOT.c.robot).where(announced)).scalars())
+
+
+def intend(
+    connection: Connection, now_ns: int, command: Command, lifetime_ns: int
+) -> StoredCommand:
+    """Store a command that waits on the server until somebody signs it; return it.
+
+    One that is stored already is returned as it is. Raises UsageError as ``create`` does.
+    """
+    known = _same_id(connection, now_ns, command)
+    if known is not None:
+        return known
+    if command.risk == "record" or command.signature is not None:
+        raise UsageError("this command needs no signature, or has one", "send it")
+    return _store(connection, now_ns, command, lifetime_ns, "unsigned")
+
+
+def _store(
+    connection: Connection, now_ns: int, command: Command, lifetime_ns: int, state: CommandState
+) -> StoredCommand:
     if not 0 < lifetime_ns <= LONGEST_NS:
         raise UsageError(
             f"a command waits for its robot for at most {LONGEST_DAYS} days",
             "choose a shorter time",
         )
-    _check_signature(connection, now_ns, command, challenges)
-    if command.signature is not None:
-        lifetime_ns = min(lifetime_ns, command.signature.ttl_s * NS)
     timed = msgspec.structs.replace(command, created_ns=now_ns, expires_ns=now_ns + lifetime_ns)
     data = _encoded(timed)
     expire(connection, now_ns, command.robot)
-    mine = (COMMAND.c.robot == command.robot, COMMAND.c.state.in_(UNANSWERED))
+    # intents that nobody signs do not take the room of commands
+    alike = UNANSWERED if state in UNANSWERED else (state,)
+    mine = (COMMAND.c.robot == command.robot, COMMAND.c.state.in_(alike))
     count = connection.scalar(select(func.count()).select_from(COMMAND).where(*mine)) or 0
     if count >= MOST_OPEN:
         raise UsageError(
-            f"{count} commands to {command.robot} wait for an answer", "wait until it is back"
+            f"{count} commands to {command.robot} wait for an answer or a signature",
+            "wait until it is back, or withdraw some",
         )
     values = {
         "id": timed.id, "robot": timed.robot, "action": timed.action,
@@ -169,12 +224,62 @@ def create(
         "step": timed.step, "risk": timed.risk,
         "key_id": "" if timed.signature is None else timed.signature.key_id,
         "created_ns": timed.created_ns, "expires_ns": timed.expires_ns, "bytes": data,
-        "state": "waiting", "reason": "", "sends": 0,
+        "state": state, "reason": "", "sends": 0,
     }  # fmt: skip
     connection.execute(COMMAND.insert(), [values])
-    found = find(connection, now_ns, timed.id)
-    assert found is not None
-    return found
+    return _known(connection, now_ns, timed.id)
+
+
+def sign(
+    connection: Connection,
+    now_ns: int,
+    command_id: str,
+    signature: CommandSignature,
+    challenges: Collection[bytes],
+) -> StoredCommand:
+    """Add a signature to a command that waits for one, which is then sent; return it.
+
+    It lives as long as it was signed for. The same signature again changes nothing; raises
+    UsageError for another one, and for what ``create`` refuses.
+    """
+    row = connection.execute(select(COMMAND).where(COMMAND.c.id == command_id)).one_or_none()
+    if row is None:
+        raise UsageError(f"there is no command '{command_id}'", "list the commands of the robot")
+    command = decode_command(row.bytes)
+    if row.state != "unsigned" or row.expires_ns <= now_ns:
+        if command.signature == signature:
+            return _known(connection, now_ns, command_id)
+        state = _stored(row, (), now_ns).state
+        raise UsageError(f"the command waits for no signature: it is {state}", "look at it again")
+    signed = msgspec.structs.replace(
+        command, signature=signature, expires_ns=now_ns + signature.ttl_s * NS
+    )
+    _check_signature(connection, now_ns, signed, challenges)
+    values = {
+        "bytes": _encoded(signed), "state": "waiting", "key_id": signature.key_id,
+        "expires_ns": signed.expires_ns,
+    }  # fmt: skip
+    mine = update(COMMAND).where(COMMAND.c.id == command_id, COMMAND.c.state == "unsigned")
+    connection.execute(mine.values(**values))
+    return _known(connection, now_ns, command_id)
+
+
+def withdraw(
+    connection: Connection, now_ns: int, robot: str, target: str, reason: str
+) -> list[str]:
+    """Withdraw commands of a robot that have no answer: one, a run's, or all; return their ids.
+
+    They are neither signed nor sent any more; what the robot says of them still counts. All are
+    those that change or move something: what only concerns the record stays.
+    """
+    expire(connection, now_ns, robot)
+    c = COMMAND.c
+    chosen = select(c.id).where(c.robot == robot, c.state.in_(OPEN))
+    chosen = chosen.where(or_(c.id == target, c.run == target) if target else c.risk != "record")
+    ids = list(connection.scalars(chosen))
+    withdrawn = update(COMMAND).where(c.id.in_(ids))
+    connection.execute(withdrawn.values(state="withdrawn", reason=reason))
+    return ids
 
 
 def _encoded(command: Command) -> bytes:
@@ -220,6 +325,12 @@ def _same_id(connection: Connection, now_ns: int, command: Command) -> StoredCom
     return find(connection, now_ns, command.id)
 
 
+def _known(connection: Connection, now_ns: int, command_id: str) -> StoredCommand:
+    found = find(connection, now_ns, command_id)
+    assert found is not None, "it was stored before"
+    return found
+
+
 def find(connection: Connection, now_ns: int, command_id: str) -> StoredCommand | None:
     """Return a command with its answers; None if there is none of this id."""
     row = connection.execute(select(COMMAND).where(COMMAND.c.id == command_id)).one_or_none()
@@ -232,14 +343,25 @@ def listed(
     robot: str = "",
     before: int | None = None,
     limit: int = 100,
+    *,
+    states: Collection[CommandState] = (),
+    run: str = "",
 ) -> list[StoredCommand]:
     """Return commands with their answers, newest first, of all robots without a name.
 
-    ``before`` is the number of a command: older ones are returned.
+    ``before`` is the number of a command: older ones are returned. ``states`` are those wanted,
+    all without one; ``run`` is the run that they belong to.
     """
     chosen = select(COMMAND).order_by(COMMAND.c.number.desc()).limit(limit)
     if robot:
         chosen = chosen.where(COMMAND.c.robot == robot)
+    if states:
+        c = COMMAND.c
+        is_late = c.state.in_(OPEN) & (c.expires_ns <= now_ns)
+        is_wanted = c.state.in_(states) & ~is_late
+        chosen = chosen.where(or_(is_wanted, is_late) if "expired" in states else is_wanted)
+    if run:
+        chosen = chosen.where(COMMAND.c.run == run)
     if before is not None:
         chosen = chosen.where(COMMAND.c.number < before)
     rows = connection.execute(chosen).all()
@@ -249,7 +371,7 @@ def listed(
 
 def expire(connection: Connection, now_ns: int, robot: str = "") -> list[str]:
     """Give up commands whose time is over without an answer; return their ids."""
-    late = [COMMAND.c.state.in_(UNANSWERED), COMMAND.c.expires_ns <= now_ns]
+    late = [COMMAND.c.state.in_(OPEN), COMMAND.c.expires_ns <= now_ns]
     if robot:
         late.append(COMMAND.c.robot == robot)
     rows = connection.execute(select(COMMAND.c.id, COMMAND.c.state).where(*late)).all()
@@ -294,7 +416,8 @@ class StoredAnswers:
     """The number of the newest of these answers, and the ids of commands that changed.
 
     The number is 0 where the robot could not store its answers: it gives them again itself.
-    ``unknown`` are ids of commands that this server does not know, answered for the first time.
+    ``unknown`` are ids of commands that this server does not know, answered for the first time; of
+    a robot at most ``MOST_UNKNOWN`` are kept.
     """
 
     number: int
@@ -332,8 +455,12 @@ def store_answers(
     known_stray = select(COMMAND_ANSWER.c.command).where(
         COMMAND_ANSWER.c.robot == robot, COMMAND_ANSWER.c.command.in_(stray)
     )
-    unknown = stray - set(connection.scalars(known_stray))
-    upsert_rows(connection, COMMAND_ANSWER, rows)
+    unknown = sorted(stray - set(connection.scalars(known_stray)))
+    if unknown:
+        kept = set(unknown[: max(0, MOST_UNKNOWN - _unknown_count(connection, robot))])
+        rows = [row for row in rows if row["command"] in kept or row["command"] not in unknown]
+        unknown = sorted(kept)
+    upsert_rows(connection, COMMAND_ANSWER, _with_room(connection, robot, rows))
     changes: dict[str, CommandAnswer] = {}
     for one in answers:
         row = known.get(one.id)
@@ -353,7 +480,33 @@ def store_answers(
     if number:
         mine = update(COMMAND_ROBOT).where(COMMAND_ROBOT.c.robot == robot)
         connection.execute(mine.values(answered=number))
-    return StoredAnswers(number, tuple(changes), tuple(sorted(unknown)))
+    return StoredAnswers(number, tuple(changes), tuple(unknown))
+
+
+def _unknown_count(connection: Connection, robot: str) -> int:
+    """Return how many commands that this server does not know have stored answers of a robot."""
+    a, ids = COMMAND_ANSWER.c, select(COMMAND.c.id).where(COMMAND.c.robot == robot)
+    wanted = select(func.count(a.command.distinct())).where(a.robot == robot, a.command.not_in(ids))
+    return int(connection.scalar(wanted) or 0)
+
+
+def _with_room(
+    connection: Connection, robot: str, rows: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """Return the answers that are stored: a robot gives three, a hostile one any number."""
+    counted = (
+        select(COMMAND_ANSWER.c.command, func.count())
+        .where(COMMAND_ANSWER.c.robot == robot)
+        .where(COMMAND_ANSWER.c.command.in_({row["command"] for row in rows}))
+        .group_by(COMMAND_ANSWER.c.command)
+    )
+    counts = Counter({row[0]: int(row[1]) for row in connection.execute(counted)})
+    found = []
+    for row in rows:
+        counts[row["command"]] += 1
+        if counts[row["command"]] <= MOST_ANSWERS:
+            found.append(row)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,14 +611,15 @@ def _answers(
     for row in connection.execute(chosen):
         if robots[row.command] == row.robot:
             found[row.command].append(ReceivedAnswer(
-                row.number, row.state, row.reason, row.result, row.at_ns, row.received_ns
+                row.number, row.state, row.reason, row.result, row.at_ns, row.received_ns,
+                row.boot, row.mono_ns,
             ))  # fmt: skip
     return found
 
 
 def _stored(row: Row[Any], answers: Sequence[ReceivedAnswer], now_ns: int) -> StoredCommand:
     state, reason = row.state, row.reason
-    if state in UNANSWERED and row.expires_ns <= now_ns:
+    if state in OPEN and row.expires_ns <= now_ns:
         state, reason = "expired", _EXPIRED[state]
     return StoredCommand(
         row.number, row.id, row.robot, row.action, row.parameters, row.issuer, row.run, row.step,

@@ -195,10 +195,26 @@ def _keep_diagnoses(connection: Connection) -> None:
     connection.execute(text(mend))
 
 
+def _share_notes(connection: Connection) -> None:
+    """Add columns to notes that robots have as well; give older notes an id."""
+    for column in (
+        "uid VARCHAR(64) NOT NULL DEFAULT ''",
+        "to_ns BIGINT",
+        "about VARCHAR(200) NOT NULL DEFAULT ''",
+        "revision BIGINT NOT NULL DEFAULT 1",
+        "withdrawn BOOLEAN NOT NULL DEFAULT 0",
+        "written_ns BIGINT NOT NULL DEFAULT 0",
+    ):
+        connection.execute(text(f"ALTER TABLE mission_note ADD COLUMN {column}"))
+    connection.execute(text("UPDATE mission_note SET uid = 'server-' || number"))
+    connection.execute(text("CREATE INDEX ix_mission_note_robot_uid ON mission_note (robot, uid)"))
+
+
 # Every migration since version 1, in order
 MIGRATIONS: Sequence[Migration] = (
     Migration(2, "an index of link_row by robot, channel and time", _index_rows),
     Migration(3, "alarms keep what their diagnosis said last", _keep_diagnoses),
+    Migration(4, "notes are shared with robots", _share_notes),
 )
 
 

@@ -64,10 +64,10 @@ class MissingRows:
 class Retention:
     """How long data are kept, in seconds since they came; None is for ever.
 
-    ``robot`` and ``keeping`` (``main``, ``bulk``, ``ring``, ``watch``, ``keep``, ``kept``) choose;
-    ``*`` is every robot, or the classes ``main``, ``bulk`` and ``ring``. What the box itself says
-    goes only by a rule for ``own``, journals of ``watch``, ``keep`` and ``kept`` only by a rule
-    that names them. What a pinned incident covers stays.
+    ``robot`` and ``keeping`` (``main``, ``bulk``, ``ring``, ``watch``, ``keep``, ``kept``, ``act``)
+    choose; ``*`` is every robot, or the classes ``main``, ``bulk`` and ``ring``. What the box
+    itself says goes only by a rule for ``own``, journals of ``watch``, ``keep``, ``kept`` and
+    ``act`` only by a rule that names them. What a pinned incident covers stays.
     """
 
     robot: str = "*"

@@ -29,7 +29,7 @@ from amberbox.core.clock import Clock
 from amberbox.core.pacing import TokenBucket
 from amberbox.core.timestamps import format_time
 from amberbox.link import limits
-from amberbox.link.folders import PACKED_BYTES
+from amberbox.link.folders import TAKEN_BYTES
 from amberbox.link.limits import NOT_SET_UP
 from amberbox.link.uploads import PROOF_BYTES
 from amberbox.server.accounts.passwords import digest
@@ -43,6 +43,7 @@ from amberbox.server.config import (
     read,
 )
 from amberbox.server.database import ServerDatabase
+from amberbox.server.experiments.shelf import UPLOADED_BYTES
 from amberbox.server.http.auth import COOKIE, PREFIX
 from amberbox.server.services.health import MetricFamily, MetricSample
 
@@ -176,7 +177,8 @@ _ROBOTS_S = 20.0, 600.0
 LIMITS: Mapping[tuple[str, str], BodyLimit] = {
     ("PATCH", f"{limits.PATH}/journals/"): BodyLimit(limits.PIECE_BYTES, *_ROBOTS_S),
     ("POST", f"{limits.PATH}/journals/"): BodyLimit(PROOF_BYTES, *_ROBOTS_S),
-    ("PUT", f"{limits.PATH}/folders/"): BodyLimit(PACKED_BYTES, *_ROBOTS_S),
+    ("POST", f"{PREFIX}/experiments"): BodyLimit(UPLOADED_BYTES, whole_s=120.0),
+    ("PUT", f"{limits.PATH}/folders/"): BodyLimit(TAKEN_BYTES, *_ROBOTS_S),
 }
 
 

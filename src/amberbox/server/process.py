@@ -36,7 +36,12 @@ from amberbox.server.archive.maintenance import ArchiveMaintenance
 from amberbox.server.bus import EventBus, ServerChange
 from amberbox.server.config import ServerSettings
 from amberbox.server.data.downloads import DownloadService
+from amberbox.server.data.missions import OpenedStores
 from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.experiments.judge import RunJudge
+from amberbox.server.experiments.robot_runs import RobotRuns
+from amberbox.server.experiments.runner import ExperimentRunner
+from amberbox.server.experiments.shelf import ExperimentShelf
 from amberbox.server.ingest.fetches import FetchService
 from amberbox.server.ingest.folders import FolderService
 from amberbox.server.ingest.link_server import LinkHooks, LinkServer, SessionRevocation
@@ -44,10 +49,13 @@ from amberbox.server.ingest.uploads import IncomingJournal, UploadService
 from amberbox.server.ingest.verification import VerificationResult
 from amberbox.server.journals import JournalKey
 from amberbox.server.knowledge.explanations import Explained, publish_diagnoses
+from amberbox.server.learning.models import LearningService
 from amberbox.server.live.feed import Feed
 from amberbox.server.live.views import FleetState
+from amberbox.server.record_orders import RecordOrders
 from amberbox.server.schema import STORE
 from amberbox.server.services.context import Services
+from amberbox.server.services.experiments import answer_diagnosis
 from amberbox.server.system import SystemLevel
 from amberbox.server.web.page import Warming
 from amberbox.server.workers.pool import RequestThreads, WorkerPool
@@ -119,6 +127,9 @@ def make_services(
     links = LinkServer(database, _hooks(bus, folders), clock)
     bus.on("command", lambda change: links.send_commands(change.robot))
     state = FleetState(database, archive, bus, links, folders, robot_worker_pool)
+    feed = Feed(database, bus, clock, links, state)
+    shelf = ExperimentShelf(folder, database, folders, clock)
+    runner = ExperimentRunner(database, bus, clock, links, feed, shelf)
     upload_service = UploadService(
         folder,
         database,
@@ -126,7 +137,8 @@ def make_services(
         clock,
         verified=partial(_keep, archive, bus),
     )
-    return Services(
+    keeping = ArchiveMaintenance(folder, database, bus, clock, archive)
+    services = Services(
         folder=folder,
         settings=settings,
         clock=clock,
@@ -141,22 +153,30 @@ def make_services(
         robot_worker_pool=robot_worker_pool,
         explained=Explained(database, archive, bus, clock, worker_pool, robot_worker_pool),
         jobs=DownloadService(folder, database, bus, clock),
+        learning=LearningService(folder, database, bus, clock),
         fetches=FetchService(folder, database, bus, clock, links),
         alarms=Alarms(database, bus, clock, settings.public_url),
-        feed=Feed(database, bus, clock, links, state),
+        record_orders=RecordOrders(database, bus, clock),
+        feed=feed,
+        runner=runner,
+        judge=RunJudge(database, bus, clock, runner.register, shelf, worker_pool),
+        robot_runs=RobotRuns(OpenedStores(database, archive), bus, clock, shelf),
         system=SystemLevel(folder, bus, clock, links),
-        keeping=ArchiveMaintenance(folder, database, bus, clock, archive),
+        keeping=keeping,
         revocation=SessionRevocation(database, bus, clock, links),
         threads=RequestThreads(),
     )
+    services.judge.answer = partial(answer_diagnosis, services)
+    return services
 
 
 def parts(services: Services) -> Sequence[BackgroundService]:
     """Return the background services."""
     return (
-        services.folders, services.worker_pool, services.explained, services.jobs, services.fetches,
-        services.alarms, services.feed, services.system, services.keeping, services.revocation,
-        Warming(),
+        services.folders, services.worker_pool, services.explained, services.jobs,
+        services.learning, services.fetches, services.alarms, services.record_orders,
+        services.feed, services.runner, services.judge, services.robot_runs, services.system,
+        services.keeping, services.revocation, Warming(),
     )  # fmt: skip
 
 
@@ -187,6 +207,7 @@ def _hooks(bus: EventBus, folders: FolderService) -> LinkHooks:
         ),
         wants_folder=folders.wants,
         commands=lambda robot, ids: bus.publish(ServerChange("answered", robot, {"ids": ids})),
+        lease=lambda robot, ids: bus.publish(ServerChange("lease", robot, {"ids": ids})),
     )
 
 

@@ -9,12 +9,15 @@ from amberbox.server import web
 from amberbox.server.api import (
     alarms,
     audit,
+    commands,
     data,
     demo,
     diagnoses,
     docs,
+    experiments,
     link,
     missions,
+    models,
     recordings,
     robots,
     server,
@@ -24,11 +27,14 @@ from amberbox.server.api import (
 from amberbox.server.http.auth import Routes
 
 API = (
-    alarms.routes, audit.routes, server.clock_routes, demo.code_routes, demo.demo_routes,
+    alarms.routes, audit.routes, server.clock_routes, commands.routes, demo.code_routes,
+    demo.demo_routes,
     diagnoses.routes, docs.routes, recordings.download_routes, robots.enrolment_routes,
+    experiments.routes,
     robots.feed_routes, recordings.fetch_routes, link.folder_routes, diagnoses.folder_routes,
     users.group_routes, server.health_routes, missions.incident_routes, data.routes,
     diagnoses.knowledge_routes, link.routes, server.metrics_routes, missions.mission_routes,
+    models.routes,
     server.notification_routes, data.query_routes, recordings.recording_routes, robots.routes,
     session.routes, server.setting_routes, server.system_routes, users.token_routes,
     users.user_routes,

@@ -23,6 +23,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    UniqueConstraint,
     event,
 )
 
@@ -568,9 +569,19 @@ MISSION_NOTE = Table(
     Column("at_ns", Time, nullable=False),
     Column("who", String(200), nullable=False),
     Column("text", Text, nullable=False),
+    Column("uid", String(64), nullable=False, server_default=""),
+    Column("to_ns", Time),
+    Column("about", String(200), nullable=False, server_default=""),
+    Column("revision", BigInteger, nullable=False, server_default="1"),
+    Column("withdrawn", Boolean, nullable=False, server_default="0"),
+    Column("written_ns", Time, nullable=False, server_default="0"),
     Index(None, "robot", "mission"),
+    Index(None, "robot", "uid"),
 )
-"""Annotations of missions and moments; ``mission`` is empty for a moment without a mission."""
+"""Notes on missions and moments; ``mission`` is empty for a moment without a mission.
+
+``uid`` is the id that the robot's record has as well.
+"""
 
 INCIDENT = Table(
     "server_incident",
@@ -833,6 +844,32 @@ and ``notes`` are JSON.
 """
 
 
+MODEL = Table(
+    "learnt_model",
+    METADATA,
+    Column("id", Id, primary_key=True),
+    Column("name", Id, nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("owner", String(128), nullable=False),
+    Column("request", Text, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("progress", Float, nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("sha256", Digest, nullable=False),
+    Column("report", Text, nullable=False),
+    Column("error", Text, nullable=False),
+    Column("asked_ns", Time, nullable=False),
+    Column("started_ns", Time, nullable=True),
+    Column("ended_ns", Time, nullable=True),
+    UniqueConstraint("name", "version"),
+    Index(None, "state", "asked_ns"),
+)
+"""Models of detectors, learnt or to be learnt. ``owner`` is the person who asked.
+
+``state``: queued, running, done, failed, cancelled, or deleted: then only its version stays, which
+is not used again. ``request`` and ``report`` are JSON.
+"""
+
 IDENTITY = Table(
     "server_identity",
     METADATA,
@@ -866,9 +903,10 @@ COMMAND = Table(
     Column("answered_ns", Time, nullable=True),
     Index(None, "robot", "state"),
 )
-"""What robots are to do. ``state``: waiting, sent, or what the robot answered; expired, with no
-``answered_ns``, where the server gave it up. ``bytes`` is sent as it is here; ``key_id`` is empty
-where it is not signed; ``epoch`` is that of the connection that sent it last."""
+"""What robots are to do. ``state``: unsigned until a person signs it, waiting, sent, or what the
+robot answered; withdrawn by a person; expired, with no ``answered_ns``, where the server gave it
+up. ``bytes`` is sent as it is here; ``key_id`` is empty where it is not signed; ``epoch`` is that
+of the connection that sent it last."""
 
 COMMAND_ANSWER = Table(
     "command_answer",
@@ -905,6 +943,36 @@ COMMAND_ROBOT = Table(
 """Robots that take commands, as they said last: number of the newest answer that is stored,
 actions (JSON, unchecked), and the lease: its number, holder and run."""
 
+RECORD_ORDER = Table(
+    "record_order",
+    METADATA,
+    Column("robot", Id, primary_key=True),
+    Column("about", String(700), primary_key=True),
+    Column("action", _Word, nullable=False),
+    Column("parameters", Text, nullable=False),
+    Column("issuer", _Who, nullable=False),
+    Column("until_ns", Time, nullable=True),
+    Column("command", Id, nullable=False, index=True),
+    Column("tries", BigInteger, nullable=False),
+    Column("seen", Boolean, nullable=False),
+)
+"""What is wanted of robots' records, by matter: the newest ``command`` for it, how many there were,
+whether it has come back in the robot's record (``seen``), and until when it means anything."""
+
+ALARM_WORD = Table(
+    "alarm_word",
+    METADATA,
+    Column("robot", Id, primary_key=True),
+    Column("source", _Word, primary_key=True),
+    Column("state", _Short, nullable=False),
+    Column("who", _Word, nullable=False),
+    Column("until_ns", Time, nullable=True),
+    Column("said_ns", Time, nullable=False),
+    Column("at_ns", Time, nullable=False),
+    Column("command", Id, nullable=False),
+)
+"""What people did last with robots' own alarms (``source``), as the robots' records say."""
+
 REVOKED_KEY = Table(
     "command_revoked_key",
     METADATA,
@@ -914,3 +982,62 @@ REVOKED_KEY = Table(
     Column("at_ns", Time, nullable=False),
 )
 """Keys of persons that sign nothing any more; rows are only added."""
+
+EXPERIMENT = Table(
+    "experiment",
+    METADATA,
+    Column("sha256", String(64), primary_key=True),
+    Column("name", Id, nullable=False),
+    Column("title", Text, nullable=False),
+    Column("who", _Who, nullable=False),
+    Column("added_ns", Time, nullable=False),
+    Column("listed", Boolean, nullable=False),
+    Index(None, "name"),
+)
+"""Experiments whose files are kept in ``DIR/experiments/SHA256``: uploaded ones, of which those
+that are ``listed`` can be started, and those of robots' folders that were started."""
+
+RUN_CLOCK = Table(
+    "run_clock",
+    METADATA,
+    Column("one", Integer, primary_key=True, autoincrement=False),
+    Column("boot_id", Id, nullable=False),
+    Column("base_ns", BigInteger, nullable=False),
+)
+"""One row: the time of runs at the server's boot. It stays while runs are under way, so that steps
+of the wall clock neither fire their timers nor hold them up, whatever restarts."""
+
+EXPERIMENT_RUN = Table(
+    "experiment_run",
+    METADATA,
+    Column("number", Counted, primary_key=True),
+    Column("id", Id, nullable=False, unique=True),
+    Column("robot", Id, nullable=False),
+    Column("kind", _Short, nullable=False),
+    Column("name", _Word, nullable=False),
+    Column("title", Text, nullable=False),
+    Column("sha256", String(64), nullable=False),
+    Column("state", _Short, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("who", _Who, nullable=False),
+    Column("parameters", Text, nullable=False),
+    Column("series", Id, nullable=False),
+    Column("left", BigInteger, nullable=False),
+    Column("diagnosis", _Word, nullable=False),
+    Column("test", String(512), nullable=False),
+    Column("config_hash", String(64), nullable=False),
+    Column("versions", Text, nullable=False),
+    Column("at_robot", Boolean, nullable=False),
+    Column("created_ns", Time, nullable=False),
+    Column("begun_ns", Time, nullable=True),
+    Column("ended_ns", Time, nullable=True),
+    Column("kept", LargeBinary, nullable=False),
+    Column("report", Text, nullable=False),
+    Index(None, "robot", "state"),
+    Index(None, "sha256"),
+)
+"""Runs of experiments and of unit tests. ``kept`` is the state of ``experiments.run.ExperimentRun``
+with all events; ``series`` are runs that repeat each other, of which ``left`` are to follow;
+``test`` is the test of the diagnosis that the verdict answers; ``report`` its verdict, ``versions``
+those of software by name, as JSON. Those that robots carried out alone (``at_robot``) come from
+their record when they are over."""

@@ -9,10 +9,13 @@ from typing import Any
 
 from sqlalchemy import RowMapping, select
 
+from amberbox.core.given_answers import RecordedAnswer
+from amberbox.core.notes import RecordedNote
 from amberbox.core.types import Diagnosis
 from amberbox.monitoring.alarms import FOLLOWS
 from amberbox.monitoring.findings import AlarmChange, Transition
 from amberbox.server.alarms import lifecycle
+from amberbox.server.alarms.agreement import agree, take_word
 from amberbox.server.alarms.alarm import (
     Alarm,
     AlarmExplanation,
@@ -23,7 +26,9 @@ from amberbox.server.alarms.alarm import (
 )
 from amberbox.server.alarms.reports import AlarmReport
 from amberbox.server.alarms.store import AlarmRegister
+from amberbox.server.annotations import take_note
 from amberbox.server.database import upsert
+from amberbox.server.knowledge.explanations import take_answer
 from amberbox.server.schema import ALARM, CONSEQUENCE
 
 _MOST = 100
@@ -166,10 +171,17 @@ def apply_reports(
 ) -> set[int]:
     """Apply reports in order; return the numbers of the alarms that changed."""
     robots: set[str] = set()
+    heard: set[tuple[str, str]] = set()
     for report in reported:
         robots.add(report.robot)
         if isinstance(report.content, AlarmChange):
             _take_alarm(register, report, report.content, now_ns, settings)
+            heard.add((report.robot, report.content.id))
+        elif isinstance(report.content, RecordedAnswer):
+            if take_answer(register.connection, now_ns, report, report.content):
+                register.commanded.add(report.robot)
+        elif isinstance(report.content, RecordedNote):
+            take_note(register.connection, report.robot, report.content)
         elif isinstance(report.content, Diagnosis):
             _take_diagnosis(register, report.robot, report.content, now_ns, settings)
             _join(register, report.robot, report.content.id, now_ns, settings)
@@ -177,6 +189,9 @@ def apply_reports(
             note_blocked(register, report, report.content)
     for robot in robots:
         show_consequences(register, robot)
+    parts = [register.part(robot, source[:128]) for robot, source in sorted(heard)]
+    for number in sorted({part.alarm for part in parts if part is not None}):
+        agree(register, number, now_ns)
     return register.touched
 
 
@@ -195,6 +210,7 @@ def _take_alarm(
         part = _housed(register, report, part, now_ns, settings)
     register.keep_part(part)
     _judge(register, part.alarm, now_ns, settings, late=report.late)
+    take_word(register, report, change, part, now_ns)
     if not part.active and change.reason.startswith(FOLLOWS):
         _follow(register, part, change.reason.removeprefix(FOLLOWS), now_ns, settings)
     elif part.diagnosis and part.active:

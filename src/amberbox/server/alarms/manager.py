@@ -13,6 +13,8 @@ from sqlalchemy import ColumnElement, Connection, and_, or_, select, update
 
 from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.given_answers import RecordedAnswer
+from amberbox.core.notes import RecordedNote
 from amberbox.server.alarms import lifecycle, outbox
 from amberbox.server.alarms import reports as boxes
 from amberbox.server.alarms.alarm import (
@@ -306,6 +308,14 @@ class Alarms:
                 boxes.mark(connection, max(one.received_ns for one in rows))
         self._late.note(found_reports, now_ns)
         self._move(news)
+        for robot in sorted(register.commanded):
+            self._bus.publish(ServerChange("command", robot, {"ids": []}))
+        for report in found_reports:
+            if isinstance(report.content, RecordedAnswer):
+                about = {"id": report.content.diagnosis}
+                self._bus.publish(ServerChange("diagnosis", report.robot, about))
+            elif isinstance(report.content, RecordedNote):
+                self._bus.publish(ServerChange("robot", report.robot))
         return register.touched
 
     def _note_clocks(self, news: list[InboxEntry]) -> None:

@@ -11,6 +11,8 @@ import msgspec
 from sqlalchemy import ColumnElement, Connection, and_, or_, select
 
 from amberbox.blackbox.journal import channels
+from amberbox.core.given_answers import RecordedAnswer, answer_of
+from amberbox.core.notes import RecordedNote, note_of
 from amberbox.core.types import Diagnosis
 from amberbox.link.frames import LinkRow
 from amberbox.monitoring.findings import AlarmChange, Transition
@@ -22,7 +24,8 @@ from amberbox.server.schema import BOOT, MARK, ROBOT, ROW, RUN
 
 CHANNELS: Final = frozenset({channels.ALARM, channels.DIAGNOSIS, channels.EVENT})
 """Channels that alarms are made of."""
-ReportContent: TypeAlias = AlarmChange | Diagnosis | Transition
+ReportContent: TypeAlias = AlarmChange | Diagnosis | Transition | RecordedAnswer | RecordedNote
+_EVENT_KINDS: Final = (b'"component_state"', b'"diagnosis_answer"', b'"note"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,10 @@ class ReceivedRow:
 
 @dataclass(frozen=True, slots=True)
 class AlarmReport:
-    """A decoded report; ``offset_ns`` is added to its times, ``late``: it arrived long after."""
+    """A decoded report; ``offset_ns`` is added to its times, ``late``: it arrived long after.
+
+    ``written_ns`` is when it was written, by the robot's clock.
+    """
 
     robot: str
     store_id: str
@@ -46,6 +52,7 @@ class AlarmReport:
     content: ReportContent
     offset_ns: int
     late: bool
+    written_ns: int = 0
 
 
 Offsets: TypeAlias = Mapping[tuple[str, str, str, int], int | None]
@@ -55,7 +62,7 @@ Offsets: TypeAlias = Mapping[tuple[str, str, str, int], int | None]
 def is_of_interest(row: LinkRow) -> bool:
     """Return whether a row may concern alarms, without decoding it."""
     if row.channel == channels.EVENT:
-        return b'"component_state"' in row.data
+        return any(kind in row.data for kind in _EVENT_KINDS)
     return row.channel in CHANNELS
 
 
@@ -72,7 +79,9 @@ def reports(rows: Iterable[ReceivedRow], offsets: Offsets, late_ns: int) -> Iter
         row = one.row
         offset_ns = offsets.get((one.robot, one.store_id, row.writer, row.run))
         late = offset_ns is None or one.received_ns - row.log_ns - offset_ns > late_ns
-        yield AlarmReport(one.robot, one.store_id, row.run, row.seq, content, offset_ns or 0, late)
+        yield AlarmReport(
+            one.robot, one.store_id, row.run, row.seq, content, offset_ns or 0, late, row.log_ns
+        )
 
 
 def _order(one: ReceivedRow) -> tuple[str, str, str, int, int]:
@@ -82,9 +91,16 @@ def _order(one: ReceivedRow) -> tuple[str, str, str, int, int]:
 def content_of(row: LinkRow) -> ReportContent | None:
     """Decode a row; None for an invalid one, which is stored all the same."""
     try:
-        found = finding(row.channel, msgspec.json.decode(row.data))
+        values = msgspec.json.decode(row.data)
     except msgspec.MsgspecError:
         return None
+    if row.channel == channels.EVENT and isinstance(values, dict) and row.writer == "watch":
+        given = answer_of(values)
+        if given is not None:
+            return given
+    if row.channel == channels.EVENT and isinstance(values, dict) and row.writer == "keep":
+        return note_of(values)
+    found = finding(row.channel, values)
     return found if isinstance(found, ReportContent) else None
 
 

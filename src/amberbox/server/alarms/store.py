@@ -22,11 +22,15 @@ _LISTS = frozenset({"blocked_by", "components", "words"})
 
 
 class AlarmRegister:
-    """The alarms within one transaction; ``touched`` are the numbers of those it has changed."""
+    """The alarms within one transaction; ``touched`` are the numbers of those it has changed.
+
+    ``commanded`` are the robots for which it has made commands.
+    """
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.touched: set[int] = set()
+        self.commanded: set[str] = set()
 
     def alarm(self, number: int) -> Alarm | None:
         """Return the alarm with a number; None if there is none."""

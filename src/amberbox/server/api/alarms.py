@@ -17,6 +17,7 @@ from amberbox.core.robot_status import Severity
 from amberbox.core.timestamps import format_time
 from amberbox.server.accounts.users import find_user
 from amberbox.server.alarms import lifecycle, store
+from amberbox.server.alarms.agreement import agree
 from amberbox.server.alarms.alarm import Alarm, Step
 from amberbox.server.alarms.store import AlarmRegister
 from amberbox.server.bus import ServerChange
@@ -170,10 +171,14 @@ def _do(
             raise HTTPException(409, "somebody changed the alarm meanwhile: look at it again")
         if user:
             _refuse_unknown(connection, user)
-        changed = AlarmRegister(connection).keep(alarm, step(alarm, name, now_ns))
+        register = AlarmRegister(connection)
+        changed = register.keep(alarm, step(alarm, name, now_ns))
+        agree(register, alarm.number, now_ns)
         who.note(connection, now_ns, f"alarms.{action}", str(alarm.number), details=details)
         page = alarm_page(connection, who, changed)
     fleet.bus.publish(ServerChange("alarm", alarm.robot, {"id": alarm.number}))
+    for robot in sorted(register.commanded):
+        fleet.bus.publish(ServerChange("command", robot, {"ids": []}))
     return page
 
 

@@ -1,4 +1,6 @@
-"""Routes of a demonstration: break and repair a simulated robot, sign in by a one-time link."""
+"""Routes of a demonstration: break and repair a simulated robot, confirm its motions, sign in by a
+one-time link.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,14 @@ demo_routes = Routes("demo")
 
 @dataclass(frozen=True, slots=True)
 class DemoRobot:
-    """A simulated robot; ``fault`` is what is broken in it, empty if it is well."""
+    """A simulated robot; ``fault`` is what is broken in it, empty if it is well.
+
+    ``code`` is shown at the robot while a motion waits to be confirmed there, else empty.
+    """
 
     robot: str
     fault: str
+    code: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,13 @@ def repair(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
     return _noted(fleet, who, demo, robot.id, ("demo.repair", {"fault": fault}))
 
 
+@demo_routes.post("/demo/{robot}/confirm", "commands.confirm")
+def confirm(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
+    """Confirm the motion that waits at a robot, as somebody who stands there."""
+    demo.confirm(robot.id)
+    return _noted(fleet, who, demo, robot.id, ("demo.confirm", {}))
+
+
 def _noted(
     fleet: Services, who: Caller, demo: Demonstration, robot: str, done: tuple[str, dict[str, str]]
 ) -> DemoView:
@@ -82,8 +95,12 @@ def _noted(
 def _view(fleet: Services, who: Caller, demo: Demonstration) -> DemoView:
     with fleet.database.reading() as connection:
         seen = {robot.id for robot in who.robots(connection)}
-    broken = demo.broken()
-    robots = [DemoRobot(robot, broken.get(robot, "")) for robot in demo.robots if robot in seen]
+    broken, codes = demo.broken(), demo.codes_at_robots()
+    robots = [
+        DemoRobot(robot, broken.get(robot, ""), codes.get(robot, ""))
+        for robot in demo.robots
+        if robot in seen
+    ]
     return DemoView(robots, list(demo.faults))
 
 

@@ -12,14 +12,17 @@ from fastapi import HTTPException, Path, Query
 from fastapi.responses import PlainTextResponse
 from pydantic import Field, StringConstraints
 
-from amberbox.core.api import DiagnosisLine
+from amberbox.core.api import DiagnosisLine, ModelLine
+from amberbox.core.equations.structure import Causality
 from amberbox.core.errors import UsageError
+from amberbox.core.notes import NO_CAUSE
 from amberbox.core.timestamps import format_time, ordered_span
+from amberbox.diagnosis.consistency.question import Minimal
 from amberbox.diagnosis.diagnose import COVERING
 from amberbox.server.accounts.robots import KnownRobot
 from amberbox.server.bus import ServerChange
 from amberbox.server.http.auth import Fleet, OfRobot, Routes, Who
-from amberbox.server.http.forms import Form, Limit, TimeText
+from amberbox.server.http.forms import Form, From, Limit, TimeText, To
 from amberbox.server.ingest.folders import FileInfo
 from amberbox.server.knowledge import explanations
 from amberbox.server.knowledge.diagnoses import (
@@ -29,32 +32,35 @@ from amberbox.server.knowledge.diagnoses import (
     read_diagnoses,
 )
 from amberbox.server.knowledge.questions import (
+    AskConsistency,
     AskDiagnosis,
+    AskResidual,
     AskRules,
+    AskStructure,
     AskTrees,
     Engine,
     RobotQuestion,
+    StructureView,
     SymptomWord,
 )
 from amberbox.server.services import knowledge
-from amberbox.server.services.context import Caller, Services, query_time_ns
+from amberbox.server.services.context import Caller, Services, query_time_ns, robot_span_ns
 from amberbox.server.services.knowledge import (
     Cause,
     DiagnosisDetail,
     FolderList,
     ServerRevision,
     TestAnswer,
+    answer_tests,
     ask_worker,
     decode_answer,
     diagnosis_line,
+    given_answers,
     revision_json,
 )
 
 routes = Routes("diagnoses")
 
-
-_TRIES = 5
-"""Number of times an answer is ranked again because another person has answered meanwhile."""
 
 _Address = Annotated[str, StringConstraints(min_length=1, max_length=300)]
 _Word = Annotated[str, StringConstraints(min_length=1, max_length=100)]
@@ -138,7 +144,7 @@ async def diagnose(
         engine=body.engine, diagnosis=body.diagnosis,
     )  # fmt: skip
     if body.diagnosis:
-        before = await asyncio.to_thread(_given, fleet, robot.id, body.diagnosis)
+        before = await asyncio.to_thread(given_answers, fleet, robot.id, body.diagnosis)
         asked = msgspec.structs.replace(asked, answers={**before, **asked.answers})
     return decode_answer(await ask_worker(fleet, who, "diagnose", asked))
 
@@ -149,25 +155,16 @@ async def answer_test(
 ) -> dict[str, Any]:
     """Say what a test gave; the diagnosis is ranked anew, and kept as a revision of the server."""
     await asyncio.to_thread(_known, fleet, robot, diagnosis)
-    for _ in range(_TRIES):
-        before = await asyncio.to_thread(_given, fleet, robot.id, diagnosis)
-        asked = AskDiagnosis(robot=robot.id, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
-                             answers={**before, **words_of(body)})  # fmt: skip
-        answer = await ask_worker(fleet, who, "diagnose", asked)
-        kept = await asyncio.to_thread(
-            _keep_answer, fleet, who, robot.id, diagnosis, body, before, answer
-        )
-        if kept:
-            fleet.bus.publish(ServerChange("diagnosis", robot.id, {"id": diagnosis}))
-            return decode_answer(answer)
-    raise UsageError("others answer tests of this diagnosis just now", "try again")
+    return decode_answer(
+        await answer_tests(fleet, who, robot.id, diagnosis, body.test, words_of(body))
+    )
 
 
 @routes.post("/robots/{robot}/diagnoses/{diagnosis}/cause", "diagnoses.write", status_code=201)
 async def say_cause(
     robot: OfRobot, diagnosis: Name, body: NewCause, fleet: Fleet, who: Who
 ) -> Cause:
-    """Say what it was in the end: a failure mode of the robot's analysis."""
+    """Say what it was in the end: a failure mode of the robot's analysis, or ``none``."""
     known = await asyncio.to_thread(_known, fleet, robot, diagnosis)
     await _check_mode(fleet, who, known, robot.id, body.failure_mode)
     cause = explanations.GivenCause(
@@ -188,7 +185,9 @@ async def _check_mode(
     fleet: Services, who: Caller, known: DiagnosisHistory, robot: str, failure_mode: str
 ) -> None:
     """Refuse an unknown failure mode; one that the diagnosis names needs no folder."""
-    if any(failure_mode in h.faults for d in known.revisions for h in d.hypotheses):
+    if failure_mode == NO_CAUSE or any(
+        failure_mode in h.faults for d in known.revisions for h in d.hypotheses
+    ):
         return
     asked = RobotQuestion(
         robot=robot, now_ns=fleet.clock.wall_ns(), config_hash=known.last.config_hash
@@ -204,34 +203,6 @@ def _known(fleet: Services, robot: KnownRobot, diagnosis: str) -> DiagnosisHisto
     if known is None:
         raise HTTPException(404, "this robot has no such diagnosis")
     return known
-
-
-def _given(fleet: Services, robot: str, diagnosis: str) -> dict[str, str]:
-    with fleet.database.reading() as connection:
-        return explanations.latest_by_test(explanations.read_answers(connection, robot, diagnosis))
-
-
-def _keep_answer(
-    fleet: Services, who: Caller, robot: str, diagnosis: str, body: NewAnswer,
-    before: dict[str, str], answer: bytes,
-) -> bool:  # fmt: skip
-    """Store an answer and the new ranking; False if another answer was stored since ``before``."""
-    now_ns, person = fleet.clock.wall_ns(), who.person
-    given, *also = [
-        explanations.GivenAnswer(test, word, person, now_ns)
-        for test, word in words_of(body).items()
-    ]
-    with fleet.database.begin() as connection:
-        if (
-            explanations.latest_by_test(explanations.read_answers(connection, robot, diagnosis))
-            != before
-        ):
-            return False
-        explanations.keep_answer(connection, robot, diagnosis, given, answer, also)
-        details: dict[str, Any] = {"diagnosis": diagnosis, "test": body.test, "answer": body.answer}
-        details |= {"also": dict(body.also)} if body.also else {}
-        who.note(connection, now_ns, "diagnoses.answer", robot, details=details)
-    return True
 
 
 def _keep_cause(
@@ -252,6 +223,15 @@ Hours = Annotated[float | None, Query(ge=0, le=1e6, allow_inf_nan=False)]
 Effect = Annotated[str, Query(max_length=200, description="a function or component; empty: all")]
 Order = Annotated[int | None, Query(ge=0, le=20, description="cut sets of up to so many events")]
 Count = Annotated[int, Query(ge=0, le=10_000)]
+ModelName = Annotated[
+    str, Query(max_length=64, description="a model's name; empty: the only one of its kind")
+]
+ResidualName = Annotated[
+    str, Query(min_length=1, max_length=200, description="a residual of the model")
+]
+ModelWords = Annotated[list[Annotated[str, Query(max_length=300)]], Query(max_length=200)]
+NO_WORDS: list[str] = []
+Most = Annotated[int, Query(ge=1, le=10_000, description="sets, or diagnoses and conflicts")]
 
 
 class RuleQuestion(Form):
@@ -278,17 +258,82 @@ async def read_fmea(
 async def read_fault_trees(
     robot: OfRobot, fleet: Fleet, who: Who, effect: Effect = "", at: At = "",
     config_hash: HashText = "", cut_sets: Count = 100, order: Order = None,
-    exposure_h: Hours = None,
+    exposure_h: Hours = None, most_probable: Count = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fault trees of all functions; of one with cut sets and what matters in it.
 
-    ``closest`` are the cut sets that the diagnosis that stands brings closest to complete.
+    The trees of the folder's ``models/*.xml`` are among them, by their top gate. One that is too
+    large has bounds and its most probable cut sets (``incomplete``). ``closest`` are the cut sets
+    that the diagnosis that stands brings closest to complete.
     """
     asked = AskTrees(
         robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at, config_hash=config_hash,
         exposure_h=exposure_h, effect=effect, cut_sets=cut_sets, order=order,
+        most_probable=most_probable,
     )  # fmt: skip
     return decode_answer(await ask_worker(fleet, who, "fault_trees", asked))
+
+
+@knowledge_routes.get("/robots/{robot}/models", "diagnoses.read")
+async def list_models(
+    robot: OfRobot, fleet: Fleet, who: Who, at: At = "", config_hash: HashText = ""
+) -> list[ModelLine]:
+    """List the models in a robot's folder, by kind and name, with what is wrong with them."""
+    return await knowledge.list_models(fleet, who, robot, at, config_hash)
+
+
+@knowledge_routes.get("/robots/{robot}/structure", "diagnoses.read")
+async def read_structure(
+    robot: OfRobot, fleet: Fleet, who: Who, model: ModelName = "",
+    show: StructureView = "faults", causality: Causality = Causality.MIXED,
+    measurable: ModelWords = NO_WORDS, fallible: bool = False, most: Most = 1000,
+    at: At = "", config_hash: HashText = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Return what a model of equations can show: which faults, or sets of equations or sensors.
+
+    ``matrix`` are its equations and unknowns in the order of Dulmage and Mendelsohn.
+    """
+    asked = AskStructure(
+        robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at, config_hash=config_hash,
+        model=model, show=show, causality=causality, measurable=measurable, fallible=fallible,
+        most=most,
+    )  # fmt: skip
+    return await knowledge.ask_model(fleet, who, "structure", asked)
+
+
+@knowledge_routes.get("/robots/{robot}/residual", "data.query")
+async def read_residual(
+    robot: OfRobot, fleet: Fleet, who: Who, residual: ResidualName, from_: From, to: To,
+    model: ModelName = "", points: Annotated[int, Query(ge=1, le=5000)] = 500,
+    at: At = "", config_hash: HashText = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Return the size of a residual of a model of equations over at most six hours, for a plot.
+
+    Of each step of ``step_s`` the size that is greatest by magnitude; null where nothing is
+    concluded. Raises HTTPException for a range without an end.
+    """
+    from_ns, to_ns = robot_span_ns(fleet, robot.id, from_, to)
+    if from_ns is None or to_ns is None:
+        raise HTTPException(400, "the range needs a beginning and an end")
+    asked = AskResidual(
+        robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at, config_hash=config_hash,
+        model=model, residual=residual, from_ns=from_ns, to_ns=to_ns, points=points,
+    )  # fmt: skip
+    return await knowledge.ask_model(fleet, who, "residual", asked)
+
+
+@knowledge_routes.get("/robots/{robot}/consistency", "diagnoses.read")
+async def read_consistency(
+    robot: OfRobot, fleet: Fleet, who: Who, model: ModelName = "",
+    observe: ModelWords = NO_WORDS, minimal: Minimal = "subset", most: Most = 1000,
+    at: At = "", config_hash: HashText = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Return which modes of a model of components agree with its steps, and with ``observe``."""
+    asked = AskConsistency(
+        robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at, config_hash=config_hash,
+        model=model, observe=observe, minimal=minimal, most=most,
+    )  # fmt: skip
+    return await knowledge.ask_model(fleet, who, "consistency", asked)
 
 
 @knowledge_routes.post("/robots/{robot}/rules", "diagnoses.write")

@@ -9,15 +9,17 @@ from typing import Annotated
 
 import msgspec
 from fastapi import HTTPException, Path, Request, Response, WebSocket
+from starlette.responses import FileResponse
 
 from amberbox.link import limits, uploads
-from amberbox.link.folders import PACKED_BYTES
+from amberbox.link.folders import TAKEN_BYTES
 from amberbox.link.uploads import HoldingsQuestion, Proof, compare_holdings
 from amberbox.server.bus import ServerChange
 from amberbox.server.certificates import CERTIFICATE
 from amberbox.server.http.auth import Fleet, Open, Routes, Who
 from amberbox.server.ingest.link_server import StarletteSocket
 from amberbox.server.ingest.uploads import IncomingJournal, UploadAnswer, held_journals, verdict
+from amberbox.server.services.models import model_for_robot
 
 routes = Routes("link", prefix=limits.PATH)
 folder_routes = Routes("link", prefix=limits.PATH)
@@ -147,11 +149,17 @@ def _answered(answer: UploadAnswer, *, with_body: bool = True) -> Response:
 Hash = Annotated[str, Path(pattern="^[0-9a-f]{64}$")]
 
 
+@folder_routes.get("/models/{sha256}", "link.connect")
+def read_model(sha256: Hash, fleet: Fleet, who: Who) -> FileResponse:
+    """Give a robot the model of detectors that a command of its own names."""
+    return FileResponse(model_for_robot(fleet, who.principal.id, sha256))
+
+
 @folder_routes.put("/folders/{config_hash}", "journals.upload", status_code=204)
 async def put_folder(config_hash: Hash, request: Request, fleet: Fleet, who: Who) -> Response:
     """Take the folder of the robot that sends it; one that is known stays as it is."""
     robot = who.principal.id
     with fleet.threads.turn(robot):
-        packed = await body_of(request, PACKED_BYTES)
+        packed = await body_of(request, TAKEN_BYTES)
         await fleet.threads.folder(partial(fleet.folders.keep, robot, config_hash, packed))
     return Response(status_code=204)

@@ -11,18 +11,17 @@ from pydantic import Field
 from amberbox.blackbox.retention.missions import RecordedMission as KnownMission
 from amberbox.core.api import Incident, Mission, MomentNote
 from amberbox.core.errors import UsageError
+from amberbox.core.notes import TEXT_LENGTH
 from amberbox.core.timestamps import format_time
 from amberbox.server import annotations as server_annotations
 from amberbox.server.bus import ServerChange
 from amberbox.server.http.auth import Fleet, OfRobot, Routes, Who
 from amberbox.server.http.forms import Form, From, Id, Limit, To
 from amberbox.server.services import recordings
-from amberbox.server.services.context import Caller, Services, robot_span_ns, robot_time_ns
+from amberbox.server.services.context import Caller, Services, robot_time_ns
 from amberbox.server.services.recordings import (
     known_missions,
-    marked_incident,
     mission_lines,
-    note_line,
 )
 
 mission_routes = Routes("missions")
@@ -51,7 +50,7 @@ class EndMission(Form):
 class NewNote(Form):
     """A remark on a mission, on a moment of it or on now."""
 
-    text: Annotated[str, Field(min_length=1, max_length=4000)]
+    text: Annotated[str, Field(min_length=1, max_length=TEXT_LENGTH)]
     at: At = ""
 
 
@@ -116,14 +115,9 @@ def annotate_mission(
 ) -> Mission:
     """Remark something on a mission, a robot's own one too."""
     mission = _find(fleet, who, robot.id, id)
-    now_ns, at_ns = fleet.clock.wall_ns(), _at(fleet, robot.id, new.at)
-    with fleet.database.begin() as connection:
-        server_annotations.annotate(connection, at_ns, robot.id, id, str(who.principal), new.text)
-        details = {"id": id, "text": new.text}
-        who.note(connection, now_ns, "missions.annotate", robot.id, details=details)
-        found = mission_lines(connection, robot.id, [mission])[0]
-    fleet.bus.publish(ServerChange("robot", robot.id))
-    return found
+    recordings.write_note(fleet, who, robot, new.text, new.at, mission=id)
+    with fleet.database.reading() as connection:
+        return mission_lines(connection, robot.id, [mission])[0]
 
 
 def _at(fleet: Services, robot: str, text: str) -> int:
@@ -139,10 +133,21 @@ def _find(fleet: Services, who: Caller, robot: str, mission_id: str) -> KnownMis
 
 
 class NewMomentNote(Form):
-    """A remark on a moment of a robot."""
+    """A remark on a moment of a robot, or on a range of time."""
 
-    text: Annotated[str, Field(min_length=1, max_length=4000)]
+    text: Annotated[str, Field(min_length=1, max_length=TEXT_LENGTH)]
     at: Annotated[str, Field(max_length=64, description="when it was; empty: now")] = ""
+    to: Annotated[str, Field(max_length=64, description="end of the range; empty: a moment")] = ""
+    about: Annotated[str, Field(max_length=200, description="item, variable or component")] = ""
+
+
+class ChangedNote(Form):
+    """The new text of a note."""
+
+    text: Annotated[str, Field(min_length=1, max_length=TEXT_LENGTH)]
+
+
+NoteId = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$", description="its key ``note``")]
 
 
 @mission_routes.get("/robots/{robot}/notes", "missions.read")
@@ -158,19 +163,25 @@ def list_notes(
 
 @mission_routes.post("/robots/{robot}/notes", "missions.write", status_code=201)
 def annotate_moment(fleet: Fleet, who: Who, robot: OfRobot, new: NewMomentNote) -> MomentNote:
-    """Remark something on a moment, whether a mission was under way then or not."""
-    now_ns = fleet.clock.wall_ns()
-    given_ns = robot_time_ns(fleet, robot.id, new.at)
-    at_ns = now_ns if given_ns is None else given_ns
-    with fleet.database.begin() as connection:
-        by = str(who.principal)
-        one = server_annotations.annotate(
-            connection, at_ns, robot.id, server_annotations.NO_MISSION, by, new.text
-        )
-        details = {"id": one.number, "at": format_time(at_ns), "text": new.text}
-        who.note(connection, now_ns, "notes.add", robot.id, details=details)
-    fleet.bus.publish(ServerChange("robot", robot.id))
-    return note_line(one)
+    """Remark something on a moment or a range, whether a mission was under way then or not.
+
+    The robot writes it into its record, too.
+    """
+    return recordings.write_note(fleet, who, robot, new.text, new.at, new.to, new.about)
+
+
+@mission_routes.post("/robots/{robot}/notes/{note}", "missions.write")
+def change_note(
+    fleet: Fleet, who: Who, robot: OfRobot, note: NoteId, new: ChangedNote
+) -> MomentNote:
+    """Change the text of a note, also of one that was written on the robot."""
+    return recordings.change_note(fleet, who, robot, note, new.text)
+
+
+@mission_routes.post("/robots/{robot}/notes/{note}/withdraw", "missions.write")
+def withdraw_note(fleet: Fleet, who: Who, robot: OfRobot, note: NoteId) -> MomentNote:
+    """Withdraw a note: it is shown no more; the robot's record states that it was there."""
+    return recordings.change_note(fleet, who, robot, note, withdrawn=True)
 
 
 incident_routes = Routes("incidents")
@@ -200,29 +211,12 @@ def list_incidents(
 def mark_incident(fleet: Fleet, who: Who, robot: OfRobot, new: NewIncident) -> Incident:
     """Mark a window: what the server has of it, or gets, is kept until it is released.
 
-    What is still on the robot is asked for with ``/fetches``.
+    The robot pins it as well, in its ring, too. It is asked for with ``/fetches``.
     """
-    from_ns, to_ns = robot_span_ns(fleet, robot.id, new.from_, new.to)
-    if from_ns is None or to_ns is None:
-        raise UsageError("a window has a beginning and an end", "give from and to")
-    with fleet.database.begin() as connection:
-        now_ns, by = fleet.clock.wall_ns(), str(who.principal)
-        marked = server_annotations.mark(
-            connection, now_ns, robot.id, (from_ns, to_ns), new.reason, by
-        )
-        details = {"id": marked.id, "from": format_time(from_ns), "to": format_time(to_ns),
-                   "reason": new.reason}  # fmt: skip
-        who.note(connection, now_ns, "incidents.mark", robot.id, details=details)
-    fleet.bus.publish(ServerChange("robot", robot.id))
-    return marked_incident(marked)
+    return recordings.mark_incident(fleet, who, robot, new.from_, new.to, new.reason)
 
 
 @incident_routes.post("/robots/{robot}/incidents/{id}/release", "incidents.write")
 def release_incident(fleet: Fleet, who: Who, robot: OfRobot, id: IncidentId) -> Incident:
     """Let a window go that was marked here: retention counts for it again."""
-    with fleet.database.begin() as connection:
-        now_ns = fleet.clock.wall_ns()
-        released = server_annotations.release(connection, now_ns, robot.id, id)
-        who.note(connection, now_ns, "incidents.release", robot.id, details={"id": id})
-    fleet.bus.publish(ServerChange("robot", robot.id))
-    return marked_incident(released)
+    return recordings.release_incident(fleet, who, robot, id)

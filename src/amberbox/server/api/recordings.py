@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse
 from pydantic import Field
 from sqlalchemy import Connection
 
-from amberbox.core.api import Download, DownloadFormat, Fetch, Recording
+from amberbox.core.api import CommandLine, Download, DownloadFormat, Fetch, Recording
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import maybe_time
@@ -92,6 +92,27 @@ def _shown(one: Kept, robot: str, rules: Sequence[Retention]) -> Recording:
         to=maybe_time(one.to_ns), came=maybe_time(one.came_ns), journal_until=maybe_time(until[0]),
         columns_until=maybe_time(until[1]),
     )  # fmt: skip
+
+
+class JournalAgain(Form):
+    """A journal that is to be sent again; ``store_id`` is that of the present store if empty."""
+
+    journal: Annotated[
+        str, Field(pattern=r"^[a-z]{1,16}/[0-9]{1,12}-[0-9a-z]{1,16}-[0-9]{1,12}\.mcap$")
+    ]
+    store_id: Annotated[str, Field(max_length=64)] = ""
+
+
+@recording_routes.post("/robots/{robot}/recordings/copy", "data.fetch", status_code=202)
+def copy_again(fleet: Fleet, who: Who, robot: OfRobot, body: JournalAgain) -> CommandLine:
+    """Let the robot send a journal again that is damaged, missing or quarantined here."""
+    return services.copy_again(fleet, who, robot, body.journal, body.store_id)
+
+
+@recording_routes.post("/robots/{robot}/recordings/rotate", "data.fetch", status_code=202)
+def rotate(fleet: Fleet, who: Who, robot: OfRobot) -> CommandLine:
+    """Let the recorder begin new files at once, so that what it has written can be copied."""
+    return services.rotate(fleet, who, robot)
 
 
 fetch_routes = Routes("fetches")

@@ -11,6 +11,7 @@ from sqlalchemy import Row
 
 from amberbox.blackbox.journal import channels
 from amberbox.blackbox.query import gaps as recorded
+from amberbox.blackbox.store.journal_reader import JournalFile
 from amberbox.blackbox.store.store import run_and_number
 from amberbox.core.types import Gap
 from amberbox.server.archive.catalogue import PUT, ArchiveCatalogue, RobotStore
@@ -164,20 +165,22 @@ _LOST = "lost at a power cut"
 
 def gaps_of(
     reader: ArchiveReader, catalogue: ArchiveCatalogue, item: str | None, span: Span,
-    refused: Mapping[RobotStore, Sequence[RefusedFile]] | None = None, read: Collection[str] = (),
+    refused: Mapping[RobotStore, Sequence[RefusedFile]] | None = None,
+    waiting: Mapping[RobotStore, Sequence[JournalFile]] | None = None,
 ) -> list[Gap]:  # fmt: skip
     """Return the gaps that overlap ``[from, to)`` of all stores, in order of time.
 
-    ``refused`` are files that are not in the archive. ``read`` names journals that wait for their
-    columns (``store/folder/file``): they are no gap, as queries read them too.
+    ``refused`` are files that are not in the archive. ``waiting`` are journals that wait for their
+    columns, and that queries read too: they are no gap, and the gaps recorded in them count.
     """
     found: list[Gap] = []
     for source in reader.sources:
         own = [n for n, v in reader.schemas.items() if v[-1].source == channels.SOURCE]
         rows, missing = catalogue.journals(source), catalogue.missing(source)
-        files = (refused or {}).get(source, ())
+        files, journals = (refused or {}).get(source, ()), (waiting or {}).get(source, ())
+        read = {journal.name for journal in journals}
         then = [*_then(rows, missing, read), *refusals(files), *holes(rows, missing, files)]
-        store = reader.of(source, *own) if own else reader.of(source, "")
+        store = reader.with_journals(source, journals, *(own or [""]))
         found += recorded.joined_gaps_in(recorded.recorded_and_known(store, then), item, span)
     return sorted(found, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
 
@@ -191,7 +194,7 @@ def _then(
             yield Gap(row.writer, row.run, gap.from_ns, gap.to_ns, gap.reason, gap.item, gap.count,
                       gap.from_seq, gap.to_seq)  # fmt: skip
         if row.state == PUT:
-            if f"{row.store_id}/{row.file}" not in read:
+            if row.file not in read:
                 yield _whole(row, WAITING)
         elif row.state == REFUSED_SOURCE:
             yield _whole(row, f"{REFUSED}{row.file}: {facts.refused}")

@@ -18,6 +18,7 @@ from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.store.catalogue import StoreCatalogue as StoreCatalogue
 from amberbox.blackbox.store.catalogue import boot_in, corrected, union
 from amberbox.blackbox.store.clocks import ClockBook, ClockTable, JournalClock, book_of
+from amberbox.blackbox.store.journal_reader import JournalFile
 from amberbox.blackbox.store.manifest import Manifest
 from amberbox.blackbox.store.manifest_entries import Segment
 from amberbox.blackbox.store.segment_file import overlaps
@@ -141,6 +142,17 @@ class ArchiveReader:
                 segments[table] = (*segments.get(table, ()), *found)
         manifest = corrected(Manifest(schemas, segments), clocks.book)
         return StoreCatalogue(self.layout.tables, manifest, book=clocks.book, stored=stored_name)
+
+    def with_journals(
+        self, source: RobotStore, journals: Sequence[JournalFile], *tables: str
+    ) -> StoreCatalogue:
+        """Return a store's catalogue of some tables (see ``of``), with journals in no table yet."""
+        store, book = self.of(source, *tables), self.clocks(source).book
+        opened = {}
+        for journal in journals:
+            points = book.points(journal.name)
+            opened[journal.name] = journal if points is None else replace(journal, clock=points)
+        return replace(store, existing=tuple(opened), opened=opened)
 
     def files(
         self, source: RobotStore, schema: TableSchema, request: RowRequest | None, level: str = ""

@@ -4,7 +4,7 @@ SQL.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -122,6 +122,28 @@ def _empty(union: TableSchema) -> str:
     return f"SELECT {', '.join(columns)} WHERE false"
 
 
+def summed(stores: Iterable[Sequence[ItemInfo]]) -> list[ItemInfo]:
+    """Return the items of several stores, each once; those of the box come last."""
+    found: dict[str, list[ItemInfo]] = {}
+    for infos in stores:
+        for info in infos:
+            found.setdefault(info.name, []).append(info)
+    added = []
+    for _, infos in sorted(found.items()):
+        largest = max(infos, key=lambda info: info.rows)  # the one whose rate is reported
+        added.append(
+            replace(
+                largest,
+                rows=sum(info.rows for info in infos),
+                first_ns=min(info.first_ns for info in infos),
+                last_ns=max(info.last_ns for info in infos),
+                bytes=sum(info.bytes for info in infos),
+                estimated=any(info.estimated for info in infos),
+            )
+        )
+    return sorted(added, key=lambda info: info.source == channels.SOURCE)
+
+
 _ATTEMPTS = 5
 Answer = TypeVar("Answer")
 
@@ -140,24 +162,7 @@ class ArchiveRecord(Record):
 
     def items(self) -> list[ItemInfo]:
         """Return the items in the tables, summed over robots and stores."""
-        found: dict[str, list[ItemInfo]] = {}
-        for infos in self._look(lambda r: [overview(r.of(source)) for source in r.sources]):
-            for info in infos:
-                found.setdefault(info.name, []).append(info)
-        summed = []
-        for _, infos in sorted(found.items()):
-            largest = max(infos, key=lambda info: info.rows)  # the one whose rate is reported
-            summed.append(
-                replace(
-                    largest,
-                    rows=sum(info.rows for info in infos),
-                    first_ns=min(info.first_ns for info in infos),
-                    last_ns=max(info.last_ns for info in infos),
-                    bytes=sum(info.bytes for info in infos),
-                    estimated=any(info.estimated for info in infos),
-                )
-            )
-        return sorted(summed, key=lambda info: info.source == channels.SOURCE)
+        return summed(self._look(lambda r: [overview(r.of(source)) for source in r.sources]))
 
     def has_item(self, item: str) -> bool:
         """See ``Record``."""

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import math
 import secrets
 import shutil
-import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 from sqlalchemy import Connection, Row, func, select, update
 
 from amberbox.core.api import DownloadFormat, DownloadState
-from amberbox.core.clock import Clock
-from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.server.bus import EventBus, ServerChange
-from amberbox.server.database import ServerDatabase
+from amberbox.core.errors import UsageError
 from amberbox.server.schema import JOB
 from amberbox.server.settings import read
-from amberbox.server.workers.pool import WorkerPool
+from amberbox.server.workers.jobs import OPEN as OPEN
+from amberbox.server.workers.jobs import JobService, OpenState
 from amberbox.server.workers.protocol import WorkerTask
 
 FOLDER = "downloads"
@@ -66,7 +60,6 @@ class Downloads:
             raise ValueError("each_waiting is 1 to 1000")
 
 
-OPEN: Sequence[DownloadState] = ("queued", "running")
 _REMEMBERED_NS = 30 * 24 * 3600 * 10**9
 
 
@@ -196,12 +189,7 @@ def _job(row: Row[Any]) -> DownloadJob:
 SETTING = "downloads"
 OP = "amberbox.server.data.worker_downloads:make"
 
-_LOOK_S = 60.0
-_REPORT_S = 1.0
-_NICE = 10
 _MEMORY_BYTES = 2 << 30
-
-Answer = TypeVar("Answer")
 
 
 class DownloadProgress(msgspec.Struct, frozen=True):
@@ -213,119 +201,44 @@ class DownloadProgress(msgspec.Struct, frozen=True):
     notes: list[str] = []
 
 
-class DownloadService:
+class DownloadService(JobService[DownloadJob]):
     """Makes the queued downloads; interrupted ones are made again."""
-
-    def __init__(self, folder: Path, database: ServerDatabase, bus: EventBus, clock: Clock) -> None:
-        self._folder = folder
-        self._database = database
-        self._bus = bus
-        self._clock = clock
-        self._pool = WorkerPool(folder, 1, nice=_NICE)
-        self._wake = asyncio.Event()
-        self._now: tuple[str, WorkerTask] | None = None
-        bus.on("job", lambda change: self._wake.set())
 
     def path(self, job: DownloadJob) -> Path:
         """Return the path of a download's file."""
         return self._folder / FOLDER / job.id / job.file
 
-    def cancel(self, job: DownloadJob) -> None:
-        """Stop making a download that was cancelled; thread-safe."""
-        now = self._now
-        if now is not None and now[0] == job.id:
-            now[1].cancel()
+    def begin_again(self, connection: Connection) -> None:
+        """See ``JobService``."""
+        begin_again(connection)
 
-    async def run(self) -> None:
-        """Work until cancelled."""
-        self._wake = asyncio.Event()  # belongs to this event loop
-        await asyncio.to_thread(self._write, begin_again)
-        await asyncio.to_thread(self._tidy)
-        while True:
-            job = await asyncio.to_thread(self._read, next_one)
-            if job is not None:
-                await self._make(job)
-                await asyncio.to_thread(self._tidy)
-                continue
-            with suppress(TimeoutError):
-                async with asyncio.timeout(_LOOK_S):  # wait_for may swallow a cancellation
-                    await self._wake.wait()
-            self._wake.clear()
-            await asyncio.to_thread(self._tidy)
+    def next_one(self, connection: Connection) -> DownloadJob | None:
+        """See ``JobService``."""
+        return next_one(connection)
 
-    def close(self) -> None:
-        """Stop the worker; an interrupted download is made again after the next start."""
-        self._pool.close()
+    def change(
+        self, connection: Connection, job_id: str, only: Sequence[OpenState], values: Any
+    ) -> bool:
+        """See ``JobService``."""
+        return change(connection, job_id, only=only, **values)
 
-    def _read(self, read_from: Callable[[Connection], Answer]) -> Answer:
+    def task(self, job: DownloadJob, receive: Callable[[bytes], None]) -> WorkerTask:
+        """See ``JobService``."""
         with self._database.reading() as connection:
-            return read_from(connection)
-
-    def _write(self, work: Callable[[Connection], Answer]) -> Answer:
-        with self._database.begin() as connection:
-            return work(connection)
-
-    async def _change(self, job: DownloadJob, only: DownloadState, **values: Any) -> bool:
-        changed = await asyncio.to_thread(
-            self._write, lambda connection: change(connection, job.id, only=[only], **values)
-        )
-        self._publish(job)
-        return changed
-
-    def _publish(self, job: DownloadJob) -> None:
-        self._bus.publish(ServerChange("job", "", {"id": job.id, "owner": job.owner}))
-
-    async def _make(self, job: DownloadJob) -> None:
-        now_ns = self._clock.wall_ns()
-        if not await self._change(job, "queued", state="running", progress=0.0, started_ns=now_ns):
-            return  # was cancelled meanwhile
-        options = await asyncio.to_thread(
-            self._read, lambda connection: read(connection, SETTING, Downloads)
-        )
-        made, reported_s = DownloadProgress(0.0), 0.0
-
-        def receive(part: bytes) -> None:
-            """Receive the worker's progress, in the pool's thread; publish it at most once a
-            second.
-            """
-            nonlocal made, reported_s
-            made = msgspec.json.decode(part, type=DownloadProgress)
-            if time.monotonic() - reported_s < _REPORT_S:
-                return
-            reported_s = time.monotonic()
-            with self._database.begin() as connection:
-                change(connection, job.id, only=["running"], progress=made.progress)
-            self._publish(job)
-
+            options = read(connection, SETTING, Downloads)
         arguments = {
             "id": job.id, "wanted": msgspec.to_builtins(job.wanted), "asked_ns": job.asked_ns,
             "most_bytes": int(options.each_gb * 1e9),
         }  # fmt: skip
-        task = WorkerTask(OP, arguments, receive, options.limit_h * 3600, _MEMORY_BYTES)
-        self._now = job.id, task
-        try:
-            self._pool.submit(task)
-            await asyncio.wrap_future(task.done)
-        except asyncio.CancelledError:
-            task.cancel()
-            raise
-        except Exception as error:  # only this download fails
-            text = error.what if isinstance(error, AmberboxError) else type(error).__name__
-            logging.getLogger(__name__).warning("%s failed", job.id, exc_info=error)
-            await self._ended(job, "failed", error=text)
-        else:
-            await self._ended(
-                job, "done", progress=1.0, file=made.file, bytes=made.bytes,
-                notes=msgspec.json.encode(made.notes).decode(),
-            )  # fmt: skip
-        finally:
-            self._now = None
+        return WorkerTask(OP, arguments, receive, options.limit_h * 3600, _MEMORY_BYTES)
 
-    async def _ended(self, job: DownloadJob, state: DownloadState, **values: Any) -> None:
-        ended_ns = self._clock.wall_ns()
-        await self._change(job, "running", state=state, ended_ns=ended_ns, **values)
+    def progress(self, part: bytes) -> tuple[float, Mapping[str, Any]]:
+        """See ``JobService``."""
+        made = msgspec.json.decode(part, type=DownloadProgress)
+        notes = msgspec.json.encode(made.notes).decode()
+        return made.progress, {"file": made.file, "bytes": made.bytes, "notes": notes}
 
-    def _tidy(self) -> None:
+    def tidy(self) -> None:
         """Delete the files of downloads that are too old, beyond the quota, or unfinished."""
         now_ns = self._clock.wall_ns()
         with self._database.begin() as connection:
@@ -337,5 +250,5 @@ class DownloadService:
                     if job.state == "done"}  # fmt: skip
         folder = self._folder / FOLDER
         for path in folder.iterdir() if folder.is_dir() else ():
-            if path.name not in kept and (self._now is None or path.name != self._now[0]):
+            if path.name not in kept and not self.is_running(path.name):
                 shutil.rmtree(path, ignore_errors=True)

@@ -188,8 +188,9 @@ def gaps_json(look: RecordSnapshot, asked: RowQuery) -> dict[str, Any]:
     Journals that wait for their columns are no gap where queries read them too.
     """
     item, span = asked.item or None, (asked.from_ns, asked.to_ns)
-    read = {f"{one.source.store_id}/{one.row.file}" for one in look.readable}
-    found = gaps_of(look.reader, look.catalogue, item, span, refused(look, asked.robot), read)
+    found = gaps_of(
+        look.reader, look.catalogue, item, span, refused(look, asked.robot), look.journals
+    )
     return {"gaps": [_gap(gap) for gap in found[: asked.limit]], "more": len(found) > asked.limit}
 
 

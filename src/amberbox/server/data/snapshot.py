@@ -6,12 +6,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sqlalchemy import Row, select
 
 from amberbox.blackbox.columns.flat_tables import TableSchema
 from amberbox.blackbox.columns.variables import item_named, suggest_names
+from amberbox.blackbox.query.overview import ItemInfo, overview
+from amberbox.blackbox.query.record import Time
+from amberbox.blackbox.query.rows import By, answer
+from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.store.catalogue import StoreCatalogue as StoreCatalogue
 from amberbox.blackbox.store.catalogue import item_of, journal_tables, union
 from amberbox.blackbox.store.journal_reader import JournalFile, journal_file
@@ -23,13 +27,18 @@ from amberbox.blackbox.store.table_reader import (
     within,
 )
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.core.types import Gap
+from amberbox.core.types import Gap, ItemSchema
 from amberbox.server.archive.catalogue import PUT, ArchiveCatalogue, RobotStore
 from amberbox.server.archive.delta_files import ArchiveLayout
+from amberbox.server.archive.gaps import gaps_of
 from amberbox.server.archive.reader import ArchiveReader, Span
+from amberbox.server.archive.record import ArchiveRecord, summed
 from amberbox.server.database import FILE, ServerDatabase
 from amberbox.server.journals import decode
 from amberbox.server.schema import JOURNALS
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.retention.missions import RecordedMission
 
 READ_BYTES = 64 << 20
 """Bytes of waiting journals that a query reads; with more, the answer states up to when it is
@@ -89,6 +98,14 @@ class RecordSnapshot:
         return found
 
     @cached_property
+    def journals(self) -> Mapping[RobotStore, Sequence[JournalFile]]:
+        """The readable journals by store, in the order of writing."""
+        found: dict[RobotStore, list[JournalFile]] = {}
+        for one in reversed(self.readable):
+            found.setdefault(one.source, []).append(one.journal)
+        return found
+
+    @cached_property
     def schemas(self) -> dict[str, list[TableSchema]]:
         """The versions of each table's schema, oldest first."""
         found = {name: list(versions) for name, versions in self.reader.schemas.items()}
@@ -144,7 +161,6 @@ class RecordSnapshot:
         self, found: GatheredRows, source: RobotStore, request: RowRequest, inside: set[str]
     ) -> None:
         span = request.span if request.by == "received" else (None, None)
-        gaps: list[Gap] = []
         for one in self.waiting:
             if not one.meets(span) or one.source != source or one.row.file in inside:
                 continue
@@ -156,7 +172,7 @@ class RecordSnapshot:
             points = self.reader.clocks(source).book.points(journal.name)
             if item is not None:
                 journal = journal if points is None else replace(journal, clock=points)
-                rows = journal_rows(journal, item, request, span, gaps)
+                rows = journal_rows(journal, item, request, span, found.gaps)
                 pieces = (within(piece, request.span, request.by) for piece in rows)
                 found.pieces += [piece for piece in pieces if len(piece)]
 
@@ -185,11 +201,19 @@ def open_catalogue(folder: Path) -> ArchiveCatalogue:
     return ArchiveCatalogue(ServerDatabase(folder / FILE, read_only=True))
 
 
-def with_snapshot(folder: Path, robot: str, question: Callable[[RecordSnapshot], Answer]) -> Answer:
-    """Answer from one snapshot of a robot's record; retry when files were joined meanwhile."""
+def with_snapshot(
+    folder: Path,
+    robot: str,
+    question: Callable[[RecordSnapshot], Answer],
+    span: Span = (None, None),
+) -> Answer:
+    """Answer from one snapshot of a robot's record; retry when files were joined meanwhile.
+
+    Of the journals that are in no table yet it has those that meet ``span``.
+    """
     catalogue, layout = open_catalogue(folder), ArchiveLayout(folder)
     for _ in range(_ATTEMPTS):
-        waiting = _waiting(catalogue, layout, robot)
+        waiting = [one for one in _waiting(catalogue, layout, robot) if one.meets(span)]
         reader = ArchiveReader(layout, catalogue, catalogue.sources([robot]))
         try:
             return question(RecordSnapshot(reader, catalogue, waiting))
@@ -214,3 +238,65 @@ def _waiting(
         )
         for r in rows
     ]
+
+
+@dataclass(frozen=True)
+class SnapshotRecord(ArchiveRecord):
+    """The record of one robot on the server, with the journals that are in no table yet and meet
+    ``span``; SQL and envelopes are answered from the tables only.
+    """
+
+    span: Span = (None, None)
+
+    def items(self) -> list[ItemInfo]:
+        """See ``Record``."""
+        return self._ask(
+            lambda look: summed(
+                overview(look.reader.with_journals(source, look.journals.get(source, ())))
+                for source in look.reader.sources
+            )
+        )
+
+    def has_item(self, item: str) -> bool:
+        """See ``Record``."""
+        return self._ask(lambda look: item in look.schemas)
+
+    def variables(self, item: str) -> ItemSchema:
+        """See ``Record``."""
+        schema = self._ask(lambda look: look.schema(item))
+        return ItemSchema(schema.type, schema.columns, {}, schema.stamp)
+
+    def query(
+        self,
+        item: str,
+        variables: Sequence[str] | None = None,
+        from_: Time = None,
+        to: Time = None,
+        by: By = "received",
+        points: int | None = None,
+        *,
+        missions: Sequence[RecordedMission] | None = None,
+    ) -> Table:
+        """See ``Record``."""
+        if missions is not None:
+            raise UsageError("missions cannot be named here", "give from and to")
+        span = self.span_ns(from_, to)
+        return self._ask(lambda look: answer(look, look.rows, item, variables, span, by, points))
+
+    def last_ns(self) -> int | None:
+        """See ``Record``."""
+        return self._ask(lambda look: look.complete_ns())
+
+    def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
+        """Return the gaps with their reasons; for one item also messages that have no columns."""
+        span = self.span_ns(from_, to)
+
+        def find(look: RecordSnapshot) -> list[Gap]:
+            found = gaps_of(look.reader, look.catalogue, item, span, waiting=look.journals)
+            return found if item is None else [*found, *look.rows(RowRequest(item, (), span)).gaps]
+
+        return self._ask(find)
+
+    def _ask(self, question: Callable[[RecordSnapshot], Answer]) -> Answer:
+        (robot,) = self.robots
+        return with_snapshot(self.path, robot, question, self.span)

@@ -5,13 +5,14 @@ People are identified by a session's cookie, programs by a token, robots by thei
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Depends, HTTPException, Path
-from starlette.requests import HTTPConnection
+from starlette.datastructures import QueryParams
+from starlette.requests import HTTPConnection, Request
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -103,12 +104,23 @@ class Routes:
 
         return add
 
-    def _add(self, method: str, path: str, rule: RouteRule, more: Mapping[str, Any]) -> Decorator:
+    def form(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:
+        """Add a route for plain forms, which work without scripts: ``Fields`` are theirs.
+
+        The CSRF token of the session is in the field ``csrf``.
+        """
+        return self._add("POST", path, RouteRule(action, each), more, (Depends(_read_fields),))
+
+    def _add(
+        self, method: str, path: str, rule: RouteRule, more: Mapping[str, Any],
+        before: Sequence[Any] = (),
+    ) -> Decorator:  # fmt: skip
         self._enter(method, path, rule)
 
         def add(endpoint: Endpoint) -> Endpoint:
+            dependencies = [*before, *_guards(rule)]
             self.router.add_api_route(
-                path, endpoint, methods=[method], dependencies=_guards(rule), **more
+                path, endpoint, methods=[method], dependencies=dependencies, **more
             )
             return endpoint
 
@@ -149,6 +161,28 @@ Fleet = Annotated[Services, Depends(services_of)]
 Who = Annotated[Caller, Depends(caller_of)]
 OfRobot = Annotated[KnownRobot, Depends(robot_of)]
 """Of a route with ``{robot}`` in its path, which the guard has looked up."""
+
+
+FORM_TYPE = "application/x-www-form-urlencoded"
+_MOST_FIELDS = 300
+
+
+async def _read_fields(request: Request) -> None:
+    """Read the fields of a plain form, for the guard and for ``Fields``."""
+    if request.headers.get("content-type", "").startswith(FORM_TYPE):
+        body = await request.body()
+        if body.count(b"&") >= _MOST_FIELDS:
+            raise HTTPException(400, f"a form has at most {_MOST_FIELDS} fields")
+        request.state.fields = QueryParams(body.decode("utf-8", "replace"))
+
+
+def _fields_of(connection: HTTPConnection) -> QueryParams:
+    found: QueryParams = getattr(connection.state, "fields", QueryParams())
+    return found
+
+
+Fields = Annotated[QueryParams, Depends(_fields_of)]
+"""The fields of a plain form, by name; of ``Routes.form``."""
 
 
 def _guards(rule: RouteRule) -> list[Any]:
@@ -218,6 +252,7 @@ def _parts(url: str) -> tuple[str, str, int | None]:
 
 COOKIE = "amberbox_session"
 CSRF_HEADER = "x-csrf-token"
+CSRF_FIELD = "csrf"
 _READS = ("GET", "HEAD", "OPTIONS")
 _BEARER = "bearer "
 
@@ -284,7 +319,7 @@ def _by_cookie(connection: HTTPConnection, services: Services) -> Caller:
     if found is None:
         raise HTTPException(401, "sign in first")
     changes = connection.scope["type"] == "http" and connection.scope["method"] not in _READS
-    if changes and not is_csrf_token(secret, connection.headers.get(CSRF_HEADER, "")):
+    if changes and not is_csrf_token(secret, _sent_token(connection)):
         raise HTTPException(403, f"a change needs the header {CSRF_HEADER} of this session")
     if needs_touch(found.session, now_ns):
         with services.database.begin() as writing:
@@ -292,6 +327,11 @@ def _by_cookie(connection: HTTPConnection, services: Services) -> Caller:
     agent = connection.headers.get("user-agent", "")
     who = found.user.principal
     return Caller(who, address_of(connection), agent, found.session.session_id, secret)
+
+
+def _sent_token(connection: HTTPConnection) -> str:
+    """Return the CSRF token of a request: from its header, or a field of its plain form."""
+    return connection.headers.get(CSRF_HEADER, "") or _fields_of(connection).get(CSRF_FIELD, "")
 
 
 def _check_origin(connection: HTTPConnection, services: Services, *, has_header: bool) -> None:

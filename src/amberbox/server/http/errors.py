@@ -16,7 +16,7 @@ from amberbox.link.limits import BUSY, DAMAGED
 from amberbox.server.accounts.passwords import TooManyError
 from amberbox.server.accounts.signin import MustWaitError, WrongLoginError
 from amberbox.server.database import DatabaseBusyError, DatabaseDamagedError
-from amberbox.server.services.context import NotFoundError
+from amberbox.server.services.context import NotFoundError, NotNowError
 from amberbox.server.workers.protocol import BrokenError, BusyError
 
 
@@ -74,6 +74,7 @@ _STATUS: Mapping[type[AmberboxError], int] = {
     TooManyError: 503,
     WrongLoginError: 401,
     NotFoundError: 404,
+    NotNowError: 409,
     DatabaseBusyError: 503,
     DatabaseDamagedError: 503,
     BusyError: 503,

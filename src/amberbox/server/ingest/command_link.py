@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
@@ -39,6 +39,15 @@ _MOST_CHALLENGES = 16
 T = TypeVar("T")
 
 
+@dataclass(frozen=True, slots=True)
+class WaitingMotion:
+    """A motion that waits for its confirmation at the robot; none with an empty ``id``."""
+
+    id: str = ""
+    by_code: bool = False
+    tries: int = 0
+
+
 @dataclass(slots=True, eq=False)
 class RobotContact:
     """One connection of a robot that takes commands, and what it said on it; not durable."""
@@ -52,22 +61,34 @@ class RobotContact:
     """Times of receipt (ns since the server's boot) and challenges, oldest first."""
     lease: LeaseState | None = None
     """Who holds the robot, as it said last; None before it did."""
+    waiting: WaitingMotion = WaitingMotion()
+    """The motion that waits for its confirmation."""
     revoked: frozenset[str] = frozenset()
     """Ids of the revoked keys that were sent."""
+    heard: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set with the next challenge, and then replaced."""
 
     def challenged(self, frame: ChallengeFrame, now_ns: int) -> bool:
-        """Keep a challenge, received at ``now_ns`` since boot; return whether the lease is news."""
+        """Keep a challenge, received at ``now_ns`` since boot.
+
+        Return whether lease or waiting motion are news.
+        """
         kept = [one for one in self.challenges if now_ns - one[0] <= _CHALLENGE_NS]
         self.challenges = (*kept[1 - _MOST_CHALLENGES :], (now_ns, frame.challenge))
-        is_news, self.lease = frame.lease != self.lease, frame.lease
-        return is_news
+        before = self.lease, self.waiting
+        self.lease = frame.lease
+        self.waiting = WaitingMotion(frame.waiting, frame.by_code, frame.tries)
+        self.heard.set()
+        self.heard = asyncio.Event()
+        return before != (self.lease, self.waiting)
 
     def fresh(self, now_ns: int) -> list[bytes]:
         """Return the challenges that a signature may be over now, oldest first."""
         return [one for at_ns, one in self.challenges if now_ns - at_ns <= _CHALLENGE_NS]
 
 
-# Called in the event loop with a robot and the ids of its commands that have changed
+# Called in the event loop with a robot and the ids of its commands that have changed, or that
+# waited or wait for their confirmation
 CommandsChanged = Callable[[str, Sequence[str]], None]
 
 
@@ -78,10 +99,17 @@ class CommandLink:
     frames are ready once it is durable; StaleEpochError where the robot has connected again.
     """
 
-    def __init__(self, writes: GroupedWrites, clock: Clock, changed: CommandsChanged) -> None:
+    def __init__(
+        self,
+        writes: GroupedWrites,
+        clock: Clock,
+        changed: CommandsChanged,
+        leased: CommandsChanged,
+    ) -> None:
         self._writes = writes
         self._clock = clock
         self._changed = changed
+        self._leased = leased
 
     def begin(self, contact: RobotContact) -> Awaitable[Sequence[ServerFrame]]:
         """Begin a connection: return revoked keys, and which answers are stored."""
@@ -99,18 +127,24 @@ class CommandLink:
     ) -> Awaitable[Sequence[ServerFrame]]:
         """Process a frame of a robot; return what to send."""
         if isinstance(frame, ChallengeFrame):
-            is_news = contact.challenged(frame, self._clock.boot_ns())
-            return self.send(contact, frame.lease if is_news else None)
+            before = contact.waiting.id
+            if not contact.challenged(frame, self._clock.boot_ns()):
+                return self.send(contact)
+            waiting = sorted({before, contact.waiting.id} - {""})
+            return self.send(contact, frame.lease, lambda: self._leased(contact.robot, waiting))
         if isinstance(frame, AnswersFrame):
             return self._answers(contact, frame)
         return self._actions(contact, frame)
 
     def send(
-        self, contact: RobotContact, lease: LeaseState | None = None
+        self,
+        contact: RobotContact,
+        lease: LeaseState | None = None,
+        recorded: Callable[[], None] = lambda: None,
     ) -> Awaitable[Sequence[ServerFrame]]:
         """Return keys that were revoked since, and the commands that are to be sent now.
 
-        A new lease is recorded.
+        A new lease is recorded, then ``recorded`` is called.
         """
         now_ns = self._clock.wall_ns()
 
@@ -120,9 +154,11 @@ class CommandLink:
             found = commands.claim(connection, contact.robot, contact.epoch, now_ns)
             return [one.key_id for one in commands.revoked_keys(connection)], found
 
-        return self._after(
-            work, lambda found: [*_revocations(contact, found[0]), *_portions(found[1])]
-        )
+        def frames(found: tuple[Sequence[str], Sequence[bytes]]) -> Sequence[ServerFrame]:
+            recorded()
+            return [*_revocations(contact, found[0]), *_portions(found[1])]
+
+        return self._after(work, frames)
 
     def _answers(
         self, contact: RobotContact, frame: AnswersFrame

@@ -18,10 +18,10 @@ from sqlalchemy import Connection, Select, delete, select
 from amberbox.core.clock import Clock
 from amberbox.core.errors import UsageError
 from amberbox.core.files import sync_folder
-from amberbox.core.names import is_id
-from amberbox.link.folders import PACKED_BYTES, FolderError, is_config_hash, travels
+from amberbox.core.names import is_id, some_names
+from amberbox.link.folders import TAKEN_BYTES, FolderError, is_config_hash, is_picture, travels
 from amberbox.server.bus import EventBus, ServerChange
-from amberbox.server.database import ServerDatabase, upsert_rows
+from amberbox.server.database import FILE, ServerDatabase, upsert_rows
 from amberbox.server.ingest.link_state import log_event
 from amberbox.server.schema import FOLDER, ROBOT
 from amberbox.server.workers.pool import WorkerPool
@@ -81,13 +81,13 @@ class FolderStore:
         place = self.place(robot, config_hash)
         found = (path for path in sorted(place.rglob("*")) if path.is_file())
         named = ((path.relative_to(place).as_posix(), path) for path in found)
-        return [FileInfo(name, path.stat().st_size) for name, path in named if travels(name)]
+        return [FileInfo(name, path.stat().st_size) for name, path in named if _may_be(name)]
 
     def read(self, robot: str, config_hash: str, name: str) -> bytes | None:
         """Return the content of a file of a folder; None if there is no such file."""
         place = self.place(robot, config_hash)
         path = place / PurePosixPath(name)
-        if not travels(name) or path.is_symlink() or not path.is_file():
+        if not _may_be(name) or path.is_symlink() or not path.is_file():
             return None
         return path.read_bytes()
 
@@ -174,8 +174,8 @@ class FolderService:
         self.shelf.place(robot, config_hash)
         if not self.wants(robot, config_hash):
             return False
-        if len(packed) > PACKED_BYTES:
-            raise FolderError(f"a packed folder has at most {PACKED_BYTES} bytes")
+        if len(packed) > TAKEN_BYTES:
+            raise FolderError(f"a packed folder has at most {TAKEN_BYTES} bytes")
         arguments = {"robot": robot, "config_hash": config_hash, "data": packed}
         answer = self._worker_pool.ask_now(
             KEEP_OP, arguments, _LIMIT_S, _MEMORY_BYTES, origin=robot
@@ -238,6 +238,31 @@ class FolderService:
         self._known.difference_update((robot, gone) for gone in old)
         for gone in old:
             self.shelf.remove(robot, gone)
+
+
+def archived_folder(data: Path, robots: Sequence[str] = ()) -> Path:
+    """Return the folder that a robot stated last, or the newest, in a server's data folder.
+
+    Raises UsageError where it has none, or has folders of several robots and none is named.
+    """
+    database = ServerDatabase(data / FILE, read_only=True)
+    newest = select(FOLDER.c.robot, FOLDER.c.config_hash).order_by(FOLDER.c.received_ns)
+    with database.reading() as connection:
+        rows = [(str(robot), str(hash_)) for robot, hash_ in connection.execute(newest)]
+        found = {robot: hash_ for robot, hash_ in rows if not robots or robot in robots}
+        stated = {robot: _stated(connection, robot) for robot in found}
+    if not found:
+        raise UsageError(f"{data} has no folder of {', '.join(robots) or 'a robot'}")
+    if len(found) > 1:
+        what = f"{data} has folders of {len(found)} robots: {some_names(list(found), 8)}"
+        raise UsageError(what, f"name one: {data}/journals/{min(found)}")
+    [(robot, hash_)] = found.items()
+    chosen = stated[robot] if (robot, stated[robot]) in rows else hash_
+    return FolderStore(data).place(robot, chosen)
+
+
+def _may_be(name: str) -> bool:
+    return travels(name) or is_picture(name)
 
 
 def _of(robot: str) -> Select[Any]:

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, 
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 from sqlalchemy import Connection, or_, select
 
@@ -27,6 +27,7 @@ from amberbox.link.frames import (
     BeatFrame,
     Bye,
     ChallengeFrame,
+    ConfirmFrame,
     FrameError,
     HasFrame,
     HeadsFrame,
@@ -112,6 +113,7 @@ class StarletteSocket:
 
 
 Value = tuple[int, float | str | None]
+T = TypeVar("T")
 # How often a heartbeat is written to the database; in between it is known in memory
 _SEEN_EVERY_NS = 10 * 1_000_000_000
 # Largest size of the names of watched variables, which have to fit in a frame many times over
@@ -147,6 +149,8 @@ class LinkHooks:
     """Whether the folder of a robot with this hash is not known yet."""
     commands: Callable[[str, Sequence[str]], None] = _nothing
     """(robot, ids of its commands that it has answered), once the answers are durable."""
+    lease: Callable[[str, Sequence[str]], None] = _nothing
+    """(robot, ids) when a robot has another holder, or other motions wait for confirmation."""
 
 
 @dataclass(slots=True, eq=False)
@@ -191,13 +195,15 @@ class LinkServer:
         self._silent_s = silent_s
         self._writes = GroupedWrites(database)
         self._watched: dict[str, tuple[str, ...]] = {}
-        self._commands = CommandLink(self._writes, self._clock, self._hooks.commands)
+        self._commands = CommandLink(
+            self._writes, self._clock, self._hooks.commands, self._hooks.lease
+        )
         self.robots: dict[str, RobotConnection] = {}
         self.unknown_frames = 0
         """Frames of robots that were ignored: this version does not know them."""
         with database.begin() as connection:
             link_state.reset_connections(connection)
-            self._server_id = server_id(connection, self._clock.wall_ns())
+            self.server_id = server_id(connection, self._clock.wall_ns())
 
     def close(self) -> None:
         """Finish pending writes; all connections have ended before."""
@@ -242,12 +248,46 @@ class LinkServer:
         self._watched[robot] = tuple(_fitting(variables))
         await self.send(robot, WatchFrame(list(self._watched[robot])))
 
-    async def order(self, robot: str, frame: LeaseFrame | AbortFrame) -> bool:
+    async def order(self, robot: str, frame: LeaseFrame | AbortFrame | ConfirmFrame) -> bool:
         """Send a frame now; return whether the robot takes commands, and received it in time.
 
         Before its first challenge a robot may not have heard Welcome yet.
         """
         return bool(self.challenges(robot)) and await self.send(robot, frame)
+
+    async def ask(
+        self,
+        robot: str,
+        frame: LeaseFrame | ConfirmFrame,
+        decided: Callable[[RobotContact], T | None],
+        within_s: float,
+    ) -> T | None:
+        """Send a frame and wait for the challenge that shows what the robot has decided.
+
+        Return what ``decided`` finds in one; None where the robot is away, or does not say in time.
+        """
+        contact = self.contact(robot)
+        if contact is None:
+            return None
+        heard = contact.heard
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                if await self.order(robot, frame):
+                    while self.contact(robot) is contact:
+                        await heard.wait()
+                        heard = contact.heard
+                        found = decided(contact)
+                        if found is not None:
+                            return found
+        return None
+
+    def contact(self, robot: str) -> RobotContact | None:
+        """Return what a robot has said of commands on its present connection.
+
+        None of one that is away, or takes no commands. May be called in any thread.
+        """
+        one = self.robots.get(robot)
+        return None if one is None else one.contact
 
     def challenges(self, robot: str) -> list[bytes]:
         """Return what a robot has minted in the last minute on its present connection.
@@ -255,8 +295,7 @@ class LinkServer:
         May be called in any thread. The newest one is the last; there is none of a robot that is
         away, or takes no commands.
         """
-        one = self.robots.get(robot)
-        contact = None if one is None else one.contact
+        contact = self.contact(robot)
         return [] if contact is None else contact.fresh(self._clock.boot_ns())
 
     def send_commands(self, robot: str = "") -> None:
@@ -327,7 +366,7 @@ class LinkServer:
         watch = self._watched.get(one.robot, ())
         welcome = one.end.admitted(
             admission, self._clock.wall_ns(), wants_folder=wants, watch=watch,
-            server_id=self._server_id,
+            server_id=self.server_id,
         )  # fmt: skip
         await one.answers.put((welcome,))
         if one.end.takes_commands:

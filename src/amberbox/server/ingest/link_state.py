@@ -67,6 +67,20 @@ def presences(connection: Connection) -> list[RobotPresence]:
     ]  # fmt: skip
 
 
+def clock_offset_ns(connection: Connection, robot: str) -> int | None:
+    """Return the server's clock minus that of a robot in its present boot (ns); None if unknown."""
+    chosen = select(BOOT.c.offset_ns).join(
+        ROBOT, and_(ROBOT.c.robot == BOOT.c.robot, ROBOT.c.boot_id == BOOT.c.boot_id)
+    )
+    return connection.execute(chosen.where(BOOT.c.robot == robot)).scalar()
+
+
+def store_of(connection: Connection, robot: str) -> str:
+    """Return the id of a robot's present store; empty for one that was never connected."""
+    found = connection.execute(select(ROBOT.c.store_id).where(ROBOT.c.robot == robot)).scalar()
+    return str(found or "")
+
+
 def newest_report_ns(connection: Connection, robot: str) -> int | None:
     """Return the robot's time of writing (ns) of its newest link row; None without any."""
     newest = (select(func.max(t.c.log_ns)).where(t.c.robot == robot) for t in (STATUS, ROW))

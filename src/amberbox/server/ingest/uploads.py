@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import threading
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, and_, select
+from sqlalchemy import Connection, Row, Select, and_, delete, select
 
 from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.core.files import sync_folder
@@ -26,9 +26,12 @@ from amberbox.link.uploads import (
     is_store_id,
     signing_key,
 )
+from amberbox.server import record_orders
 from amberbox.server.database import ServerDatabase, upsert_rows
 from amberbox.server.ingest.link_state import is_other_history, key_state, log_event, waiting_reason
 from amberbox.server.ingest.verification import UploadClaim, VerificationResult, Verifier
+from amberbox.server.journals import sha256_of
+from amberbox.server.record_orders import RecordOrder
 from amberbox.server.schema import JOURNALS, UPLOAD
 
 
@@ -163,6 +166,35 @@ def is_held(root: Path, row: Row[Any]) -> bool:
         return False
 
 
+def copies_of(
+    connection: Connection, robot: str, store_id: str, journal: str
+) -> Sequence[Row[Any]]:
+    """Return the ``known_uploads`` of a journal, by whichever content."""
+    u = UPLOAD.c
+    same = and_(u.robot == robot, u.store_id == store_id, u.journal == journal)
+    return connection.execute(known_uploads().where(same, u.state != "incoming")).all()
+
+
+def is_sound(root: Path, row: Row[Any]) -> bool:
+    """Return whether the file of one of ``known_uploads`` has the content that was verified."""
+    try:
+        return sha256_of(root / str(row.path)) == str(row.sha256)
+    except OSError:
+        return False
+
+
+def copy_matter(store_id: str, journal: str) -> str:
+    """Return the matter of the order to send a journal again (``record_orders``)."""
+    return f"journal:{store_id}/{journal}"
+
+
+def _wanted_again(connection: Connection, incoming: IncomingJournal) -> RecordOrder | None:
+    """Return the order to send a journal again that its robot may still follow; None without."""
+    about = copy_matter(incoming.store_id, incoming.journal)
+    order = record_orders.find(connection, incoming.robot, about)
+    return order if order is not None and order.is_under_way else None
+
+
 def _sizes(folder: Path) -> dict[str, int]:
     try:
         with os.scandir(folder) as entries:
@@ -173,6 +205,9 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 _TOO_MUCH = "too much of this robot waits here already"
 _KEPT_S = 7 * 86_400.0
+_KEYS = ("robot", "store_id", "journal", "sha256")
+# What a copy changes that replaces a damaged one, or one that was not taken
+_CHANGED = ("state", "reason", "path", "signed", "ended_ns")
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,8 +299,11 @@ class UploadService:
         )  # fmt: skip
         with self.database.reading() as connection:
             row = connection.execute(known_uploads().where(same)).first()
+            again = row is not None and _wanted_again(connection, incoming) is not None
         if row is None or not is_held(self.root, row):
             return None
+        if again and not (row.state == "verified" and is_sound(self.root, row)):
+            return None  # the copy that is held is damaged, or was not taken
         return UploadAnswer(200, incoming.size, row.state, row.reason)
 
     def _waiting_bytes(self, robot: str) -> int:
@@ -341,7 +379,11 @@ class UploadService:
                 "end_seq": result.end_seq, "start_ns": result.start_ns, "end_ns": result.end_ns,
                 "began_ns": now_ns, "ended_ns": now_ns,
             }  # fmt: skip
-            upsert_rows(connection, UPLOAD, [row])
+            order = _wanted_again(connection, incoming)
+            upsert_rows(connection, UPLOAD, [row], () if order is None else _CHANGED)
+            if order is not None:
+                record_orders.see(connection, incoming.robot, order.about, order.command)
+                self._drop_quarantined(connection, incoming, state)
             if state != "verified":
                 log_event(
                     connection, incoming.robot, now_ns, state, _event_text(incoming, state, result)
@@ -349,6 +391,18 @@ class UploadService:
         if state != "quarantined":
             self.verified(incoming, result, target)
         return UploadAnswer(200, incoming.size, state, result.reason)
+
+    def _drop_quarantined(
+        self, connection: Connection, incoming: IncomingJournal, state: State
+    ) -> None:
+        """Drop what was quarantined of a journal, once a sound copy has come."""
+        if state != "verified":
+            return
+        for row in copies_of(connection, incoming.robot, incoming.store_id, incoming.journal):
+            if row.state == "quarantined":
+                (self.root / row.path).unlink(missing_ok=True)
+                keys = [getattr(UPLOAD.c, key) == getattr(row, key) for key in _KEYS]
+                connection.execute(delete(UPLOAD).where(*keys))
 
 
 def verdict(answer: UploadAnswer) -> Verdict:

@@ -12,7 +12,7 @@ import msgspec
 from amberbox.core.errors import Problem
 from amberbox.core.redaction import MASK, SECRET_WORDS, SOUNDS_SECRET, redact, secrets_by_name
 from amberbox.core.yaml_nodes import parse_yaml
-from amberbox.link.folders import unpack
+from amberbox.link.folders import is_picture, unpack
 from amberbox.server.ingest.folders import FolderContents, FolderStore
 from amberbox.server.ingest.verification import verify_arguments
 from amberbox.server.workers.process import leave_with_server
@@ -32,7 +32,7 @@ _VALUE = re.compile(r"[\"']?\s*[:=>]\s*(?P<value>[^\s{\[|>&*].*)")
 
 def masked(files: Mapping[str, bytes]) -> tuple[dict[str, bytes], list[str]]:
     """Return the files with secrets masked, and the names of those that had any."""
-    found = {name: _masked(name, data) for name, data in files.items()}
+    found = {n: data if is_picture(n) else _masked(n, data) for n, data in files.items()}
     return found, [name for name in files if found[name] != files[name]]
 
 

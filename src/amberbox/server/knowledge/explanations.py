@@ -10,15 +10,18 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import msgspec
 from sqlalchemy import Connection, Row, Table, select
 
 from amberbox.blackbox.journal import channels
-from amberbox.core.clock import Clock
+from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.given_answers import RecordedAnswer
+from amberbox.core.record_commands import DiagnosisAnswer
 from amberbox.core.types import Diagnosis
+from amberbox.server import record_orders
 from amberbox.server.archive.folder import FolderArchive
 from amberbox.server.bus import EventBus, ServerChange
 from amberbox.server.database import ServerDatabase
@@ -58,9 +61,29 @@ class Revision:
     body: dict[str, Any]
 
 
+# A row of a robot may be read twice, with clock offsets that differ a little
+_SAME_NS = 5 * NS
+
+
+class AnswerReport(Protocol):
+    """Where and when an answer at a robot was written; times in ns, ``written_ns`` by its clock."""
+
+    @property
+    def robot(self) -> str:
+        """Return the robot's id."""
+
+    @property
+    def written_ns(self) -> int:
+        """Return when it was written."""
+
+    @property
+    def offset_ns(self) -> int:
+        """Return the server's clock minus the robot's."""
+
+
 def read_answers(connection: Connection, robot: str, diagnosis: str) -> list[GivenAnswer]:
-    """Return all answers given to the tests of a diagnosis, in order."""
-    rows = _rows(connection, ANSWER, robot, diagnosis)
+    """Return all answers given to the tests of a diagnosis, in order of time."""
+    rows = sorted(_rows(connection, ANSWER, robot, diagnosis), key=lambda row: row.at_ns)
     return [GivenAnswer(row.test, row.answer, row.who, row.at_ns) for row in rows]
 
 
@@ -106,6 +129,58 @@ def keep_answer(
     rows = [{**about, "test": of.test, "answer": of.answer} for of in (one, *also)]
     connection.execute(ANSWER.insert(), rows)
     connection.execute(REVISION.insert(), [{**about, "body": body.decode()}])
+
+
+def send_answers(
+    connection: Connection, now_ns: int, robot: str, diagnosis: str, given: Sequence[GivenAnswer]
+) -> bool:
+    """Let the robot's own diagnosis know what people answered; return whether a command was made.
+
+    The caller publishes ``command`` for the robot after the transaction.
+    """
+    made = []
+    for one in given:
+        about, who = f"answer:{diagnosis}:{one.test}", record_orders.person_label(one.who)
+        wanted = DiagnosisAnswer(diagnosis, one.test, one.answer, who)
+        made.append(record_orders.order(connection, now_ns, robot, about, wanted, who))
+    return any(made)
+
+
+def take_answer(
+    connection: Connection, now_ns: int, report: AnswerReport, given: RecordedAnswer
+) -> bool:
+    """Take an answer from a robot's record; return whether the robot is told that another counts.
+
+    One that was given there is stored once, an echo of a command is only noted. Of several answers
+    to one test the last one counts, by the server's estimate of the time; the robot counts the one
+    that came last.
+    """
+    if given.command:
+        about = f"answer:{given.diagnosis}:{given.test}"
+        record_orders.see(connection, report.robot, about, given.command)
+        order = record_orders.find(connection, report.robot, about)
+        if order is not None and order.command == given.command:
+            return False
+    else:
+        _keep_given(connection, report, given)
+    known = read_answers(connection, report.robot, given.diagnosis[:128])
+    last = next((one for one in reversed(known) if one.test == given.test), None)
+    if last is None or last.answer == given.answer:
+        return False
+    return send_answers(connection, now_ns, report.robot, given.diagnosis, [last])
+
+
+def _keep_given(connection: Connection, report: AnswerReport, given: RecordedAnswer) -> None:
+    row: dict[str, Any] = {
+        "robot": report.robot, "diagnosis": given.diagnosis[:128], "test": given.test[:512],
+        "answer": given.answer[:128], "who": f"{given.who} at the robot",
+        "at_ns": min(max(report.written_ns + report.offset_ns, 0), 1 << 62),
+    }  # fmt: skip
+    row = {name: v.replace("\0", "") if isinstance(v, str) else v for name, v in row.items()}
+    same = [ANSWER.c[name] == row[name] for name in ("robot", "diagnosis", "test", "answer", "who")]
+    near = ANSWER.c.at_ns.between(row["at_ns"] - _SAME_NS, row["at_ns"] + _SAME_NS)
+    if connection.execute(select(ANSWER.c.number).where(*same, near).limit(1)).first() is None:
+        connection.execute(ANSWER.insert(), [row])
 
 
 def keep_cause(connection: Connection, robot: str, diagnosis: str, cause: GivenCause) -> None:

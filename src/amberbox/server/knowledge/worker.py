@@ -24,6 +24,7 @@ from amberbox.blackbox.retention.missions import RecordedMission
 from amberbox.consult.context import RobotWindow, context_from_findings
 from amberbox.consult.folder_knowledge import DeclaredRobot, read_declared_robot
 from amberbox.consult.rule_lookups import record_predicates
+from amberbox.consult.run_answers import answers_to
 from amberbox.core.config import raise_errors
 from amberbox.core.contracts import Budget, GivenEvidence, Span
 from amberbox.core.errors import AmberboxError, UsageError
@@ -38,6 +39,7 @@ from amberbox.diagnosis.diagnose import (
 )
 from amberbox.diagnosis.evidence.rules import Facts, known_facts
 from amberbox.diagnosis.faulttree.analysis import Analysis, analyse
+from amberbox.diagnosis.faulttree.tree import FaultTree
 from amberbox.diagnosis.fmea.criticality import coverage
 from amberbox.diagnosis.fmea.fault_trees import (
     closest_json,
@@ -47,12 +49,15 @@ from amberbox.diagnosis.fmea.fault_trees import (
     fault_tree_of,
     outlooks,
 )
+from amberbox.diagnosis.fmea.model import Fmea
 from amberbox.diagnosis.fmea.sheet import coverage_json, criticality_json, table_json
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.models import trees_of
 from amberbox.diagnosis.prolog.program import read_rules
 from amberbox.diagnosis.prolog.query import ask
 from amberbox.diagnosis.report.serialiser import context_json, explain_context, with_end_times
 from amberbox.diagnosis.report.wording import FaultNames
+from amberbox.diagnosis.symptom_presence import SymptomPresences
 from amberbox.monitoring.current_state import RecordedFindings
 from amberbox.monitoring.mode_evaluation import meets
 from amberbox.monitoring.plan import Expectation, ModePlan, MonitoringPlan, measured_from
@@ -65,10 +70,16 @@ from amberbox.server.database import ServerDatabase
 from amberbox.server.derived import MOST, derived_records
 from amberbox.server.drawing.faulttree import tree_drawing
 from amberbox.server.ingest.folders import FOLDERS, FolderStore
-from amberbox.server.knowledge.diagnoses import EvidenceMoment, evidence_at, find_diagnosis
+from amberbox.server.knowledge.diagnoses import (
+    EvidenceMoment,
+    evidence_at,
+    find_diagnosis,
+    newest_diagnosis,
+)
 from amberbox.server.knowledge.questions import (
     AskDiagnosis,
     AskRules,
+    AskRunAnswers,
     AskTrees,
     RobotQuestion,
     decode_question,
@@ -104,7 +115,8 @@ def without_paths(folder: Path, text: str) -> str:
 
 _CLOSEST = 5
 _NODES = 2_000_000
-_KEPT = 8
+_TREES_SHARE = 0.8  # of the time; the rest is for an answer when a step of the search takes long
+_KEPT = 32
 """Trees that are kept solved; each can have many nodes."""
 _SOLVED: OrderedDict[tuple[object, ...], Analysis] = OrderedDict()
 
@@ -112,16 +124,16 @@ _SOLVED: OrderedDict[tuple[object, ...], Analysis] = OrderedDict()
 @json_operation
 def diagnose(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the diagnosis of a robot with its explanation."""
-    return answer_diagnosis(folder, _stores(folder), decode_question(arguments, AskDiagnosis))
+    return answer_diagnosis(folder, opened_stores(folder), decode_question(arguments, AskDiagnosis))
 
 
 @json_operation
 def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the FMEA table, criticality and detection coverage."""
     asked = decode_question(arguments, RobotQuestion)
-    stores = _stores(folder)
+    stores = opened_stores(folder)
     subject, notes = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, watched_hash(stores, asked)
     )
     found = subject.faults()
     return {
@@ -141,7 +153,7 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the fault trees of all functions, or one with its cut sets and those closest to
     complete.
     """
-    return _trees(folder, _stores(folder), decode_question(arguments, AskTrees))
+    return _trees(folder, opened_stores(folder), decode_question(arguments, AskTrees))
 
 
 def _trees(folder: Path, stores: OpenedStores, asked: AskTrees) -> dict[str, Any]:
@@ -153,23 +165,57 @@ def _trees(folder: Path, stores: OpenedStores, asked: AskTrees) -> dict[str, Any
         asked.config_hash,
         then.config_hash if asked.at else "",
     )
-    known = subject.faults()
-    names = _effects(known, asked.effect)
-    budget = Budget(_NODES, _ends(asked.seconds))
-    one = bool(asked.effect)
-    solved = [_solved(subject, name, asked, budget, with_sets=one) for name in names]
+    known, trees = _sources(subject)
+    names = _effects(known, trees, asked.effect)
+    one, budget = bool(asked.effect), tree_budget(_TREES_SHARE * asked.seconds)
+    solved = [
+        _solved(subject, name, asked, budget.turn(len(names) - place), with_sets=one)
+        for place, name in enumerate(names, 1)
+    ]
     shown = (
-        effect_json(known, solved[0], importance=True, cut_sets=asked.cut_sets)
+        effect_json(known, solved[0], True, asked.cut_sets, asked.most_probable)
         if one
-        else effects_json(known, solved, asked.exposure_h)
+        else effects_json(known, solved, asked.exposure_h, probable=asked.most_probable)
     )
     standing = _standing(then.findings.diagnoses)
-    closest = closest_json(known, then.at_ns, standing, outlooks(solved, standing, _CLOSEST))
+    with_chances = [one for one in solved if not one.without_probability]
+    found = outlooks(with_chances, standing, _CLOSEST)
+    closest = closest_json(known, then.at_ns, standing, found)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     return {
         **about, **shown, "at": format_time(then.at_ns), "closest": closest["effects"],
         "diagnosis": closest["diagnosis"], "notes": [*then.notes, *notes],
     }  # fmt: skip
+
+
+def _sources(subject: DeclaredRobot) -> tuple[Fmea, Mapping[str, FaultTree]]:
+    """Return the failure modes and the trees of a folder; one of them may be empty."""
+    trees = _folder_trees(subject.folder.path)
+    bare = subject.fmea is None and not subject.problems and trees
+    return (Fmea("", {}, {}, {}, {}) if bare else subject.faults()), trees
+
+
+@lru_cache(maxsize=4)
+def _folder_trees(place: Path) -> Mapping[str, FaultTree]:
+    """Return the trees of a folder's files, cached: the content behind a hash never changes."""
+    return trees_of(place)
+
+
+def _tree_of(subject: DeclaredRobot, name: str, exposure_h: float | None) -> FaultTree:
+    known, trees = _sources(subject)
+    if name in trees and name not in known.needs():
+        return trees[name]
+    return fault_tree_of(known, name, exposure_h)
+
+
+def tree_budget(seconds: float) -> Budget:
+    """Return a budget that ends after so much time, and leaves half of it for bounds."""
+    began_s = time.monotonic()
+
+    def is_past(share: float) -> bool:
+        return time.monotonic() >= began_s + share * seconds
+
+    return Budget(_NODES, lambda: is_past(1.0), is_past=is_past)
 
 
 def _solved(
@@ -179,10 +225,9 @@ def _solved(
     key = (asked.robot, subject.folder.config_hash, name, asked.exposure_h, asked.order, with_sets)
     found = _SOLVED.get(key)
     if found is None:
-        tree = fault_tree_of(subject.faults(), name, asked.exposure_h)
+        tree = _tree_of(subject, name, asked.exposure_h)
         found = analyse(tree, asked.order, with_sets, budget)
-        if not found.incomplete:
-            _SOLVED[key] = found
+        _SOLVED[key] = found
     while len(_SOLVED) > _KEPT:
         _SOLVED.popitem(last=False)
     return found
@@ -195,25 +240,28 @@ def one_tree(folder: Path, arguments: dict[str, Any]) -> Any:
     Only this tree is solved; without a function, the first. ``functions`` lists all, by id and in
     words.
     """
-    asked, stores = decode_question(arguments, AskTrees), _stores(folder)
-    folder_hash = _watched_hash(stores, asked)
+    asked, stores = decode_question(arguments, AskTrees), opened_stores(folder)
+    folder_hash = watched_hash(stores, asked)
     subject, _ = folder_at(folder, stores.database, asked.robot, asked.config_hash, folder_hash)
-    known = subject.faults()
-    every, names = _effects(known, ""), FaultNames(known)
+    known, trees = _sources(subject)
+    every, names = _effects(known, trees, ""), FaultNames(known)
     chosen = asked.effect or next(iter(every), "")
-    functions = [{"id": one, "text": names.function(one)} for one in every]
+    functions = [
+        {"id": one, "text": names.function(one) if one in known.functions else _label(trees, one)}
+        for one in every
+    ]
     if not chosen:
         return {"functions": functions, "tree": None, "shape": None}
-    _effects(known, chosen)
+    _effects(known, trees, chosen)
     found = _trees(folder, stores, msgspec.structs.replace(asked, effect=chosen))
-    shape = tree_drawing(fault_tree_of(known, chosen, asked.exposure_h))
+    shape = tree_drawing(_tree_of(subject, chosen, asked.exposure_h))
     return {"functions": functions, "tree": found, "shape": msgspec.to_builtins(shape)}
 
 
 @json_operation
 def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return all answers of the robot's rules and record to a goal."""
-    asked, stores = decode_question(arguments, AskRules), _stores(folder)
+    asked, stores = decode_question(arguments, AskRules), opened_stores(folder)
     subject, notes = folder_at(folder, stores.database, asked.robot, asked.config_hash, "")
     program = read_rules(subject.rules())
     raise_errors(program.problems())
@@ -222,7 +270,7 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     window = open_window(stores, asked.robot, *span)
     facts = tuple(known_facts(asked.robot, subject.fmea, asked.exposure_h))
     program = Facts(facts, (), tuple(record_predicates(window))).added_to(program)
-    budget = Budget(steps=asked.steps or Budget().steps, is_over=_ends(asked.seconds))
+    budget = Budget(steps=asked.steps or Budget().steps, is_over=ends(asked.seconds))
     found = ask(program, asked.query, budget, asked.want or None)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     more_notes = [str(note) for note in program.notes]
@@ -244,28 +292,54 @@ def _not_looked_at(stores: OpenedStores, asked: AskRules, files: Iterable[Path])
 @json_operation
 def failure_modes(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the ids of all failure modes in a robot's folder at a time."""
-    asked, stores = decode_question(arguments, RobotQuestion), _stores(folder)
+    asked, stores = decode_question(arguments, RobotQuestion), opened_stores(folder)
     subject, _ = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, watched_hash(stores, asked)
     )
     return sorted(subject.faults().modes)
 
 
-def _stores(folder: Path) -> OpenedStores:
+@json_operation
+def run_answers(folder: Path, arguments: dict[str, Any]) -> Any:
+    """Return what a finished run answers to the open diagnosis of a robot: its id, and answers."""
+    asked, stores = decode_question(arguments, AskRunAnswers), opened_stores(folder)
+    if asked.diagnosis:
+        known = find_diagnosis(stores, asked.robot, asked.diagnosis)
+    else:
+        known = newest_diagnosis(stores, asked.robot)
+    if known is None or known.last.state != "open":
+        return {"diagnosis": "", "answers": {}}
+    subject, _ = folder_at(folder, stores.database, asked.robot, known.last.config_hash, "")
+    given = (
+        {}
+        if subject.fmea is None
+        else answers_to(known.last, subject.knowledge(), asked.kind, asked.name, asked.verdict)
+    )
+    return {"diagnosis": known.id, "answers": given}
+
+
+def opened_stores(folder: Path) -> OpenedStores:
+    """Return what is stored in a server's data folder."""
     database = open_catalogue(folder).database
     return OpenedStores(database, FolderArchive(folder, database))
 
 
-def _watched_hash(stores: OpenedStores, asked: RobotQuestion) -> str:
+def watched_hash(stores: OpenedStores, asked: RobotQuestion) -> str:
     """Return the hash of the folder that the watcher used at the time asked for, or empty."""
     return evidence_at(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
 
 
-def _effects(known: Any, effect: str) -> list[str]:
-    names = effects(known)
+def _effects(known: Fmea, trees: Mapping[str, FaultTree], effect: str) -> list[str]:
+    """Return the names of all trees, or of the one asked for."""
     if not effect:
-        return list(names)
-    return [component_id(effect, [*known.functions, *known.components], kind="function")]
+        return list(dict.fromkeys((*effects(known), *trees)))
+    every = [*known.functions, *known.components, *trees]
+    return [component_id(effect, every, kind="function")]
+
+
+def _label(trees: Mapping[str, FaultTree], top: str) -> str:
+    """Return the name of a tree of a file for people."""
+    return trees[top].gates[top].label or top
 
 
 def _standing(diagnoses: Any) -> Any:
@@ -278,7 +352,8 @@ def _time(text: str, now_ns: int, last_ns: int) -> int | None:
     return parse_time(text, lambda: now_ns, lambda: last_ns) if text else None
 
 
-def _ends(seconds: float) -> Callable[[], bool]:
+def ends(seconds: float) -> Callable[[], bool]:
+    """Return a function that is true once so much time is over."""
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() > end_s
 
@@ -289,7 +364,16 @@ _SHOWN = 12
 def folder_at(
     folder: Path, database: ServerDatabase, robot: str, wanted: str, watched: str
 ) -> tuple[DeclaredRobot, tuple[str, ...]]:
-    """Return the contents of a robot's folder, and notes about its version.
+    """Return the contents of a robot's folder, and notes about its version; see ``place_at``."""
+    place = place_at(folder, database, robot, wanted, watched)
+    found = _read(place, robot, place.name)
+    if not watched or watched == place.name:
+        return found, ()
+    return found, (f"its watcher had the folder {watched[:_SHOWN]} then, not this one",)
+
+
+def place_at(folder: Path, database: ServerDatabase, robot: str, wanted: str, watched: str) -> Path:
+    """Return where a robot's folder is stored; the last part of the path is its hash.
 
     ``wanted`` is the hash that the caller asks for, ``watched`` the one that the robot's watcher
     used at the time; without either it is the folder that the robot stated last. Raises UsageError
@@ -299,10 +383,7 @@ def folder_at(
     place = shelf.place(robot, config_hash) if config_hash else None
     if place is None or not place.is_dir():
         raise _not_here(database, robot, config_hash)
-    found = _read(place, robot, config_hash)
-    if not watched or watched == config_hash:
-        return found, ()
-    return found, (f"its watcher had the folder {watched[:_SHOWN]} then, not this one",)
+    return place
 
 
 @lru_cache(maxsize=4)
@@ -513,8 +594,9 @@ def _as_revised(case: DiagnosisContext) -> DiagnosisContext:
 
 def _known(knowledge: Knowledge, findings: RecordedFindings) -> RecordedFindings:
     """Return the findings without symptoms that this folder's FMEA does not know."""
-    names = knowledge.fmea.symptoms
-    return RecordedFindings([s for s in findings.symptoms if s.id in names], findings.diagnoses)
+    presences = SymptomPresences(knowledge.fmea)
+    known = [symptom for symptom in findings.symptoms if presences.knows(symptom.id)]
+    return RecordedFindings(known, findings.diagnoses)
 
 
 def _texts(given: dict[str, Any]) -> list[str]:

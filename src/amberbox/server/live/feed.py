@@ -296,6 +296,10 @@ class LiveValueRelay:
         """Note that the watched variables may have changed."""
         self._changed.set()
 
+    def value(self, robot: str, variable: str) -> Value | None:
+        """Return the latest value of a watched variable, with its time; None before one came."""
+        return self._values.get(robot, {}).get(variable)
+
     def take(self, robot: str, values: Mapping[str, Value]) -> bool:
         """Store received values; return whether any of them is watched."""
         asked = self._requested.get(robot)
@@ -382,8 +386,10 @@ class Feed:
         self.state = state
         self.ring = ChangeRing(clock.wall_ns())
         self._first = self.ring.number
-        self.live = LiveValueRelay(links, lambda: [one.watch for one in self.listeners])
+        self.live = LiveValueRelay(links, self._watches)
         self.listeners: list[LiveListener] = []
+        self.own_watch: Mapping[str, frozenset[str]] = {}
+        """Variables that the server itself reads live, by robot; ``watch`` sets them."""
         self._links = links
         self._database = database
         self._bus = bus
@@ -391,6 +397,7 @@ class Feed:
         self._memory = RetainedStatuses()
         self._silence = SilenceMonitor()
         self._repeated: set[str] = set()
+        self._reported: set[str] = set()
         self._pending: dict[str, list[dict[tuple[str, str], StatusChange]]] = {}
         self._is_due = False
         self._last_s = 0.0
@@ -438,6 +445,26 @@ class Feed:
             self.listeners.remove(listener)
         self.live.look_again()
 
+    def watch(self, variables: Mapping[str, frozenset[str]]) -> None:
+        """Set the variables that the server itself reads live, by robot; in the event loop."""
+        if variables != self.own_watch:
+            self.own_watch = dict(variables)
+            self.live.look_again()
+
+    def _watches(self) -> list[Watch]:
+        own = {robot: sorted(names) for robot, names in self.own_watch.items()}
+        return [own, *(one.watch for one in self.listeners)]
+
+    def statuses(self, robot: str) -> Mapping[tuple[str, str], StatusRecord]:
+        """Return the statuses of a robot's components and modes as they are now.
+
+        There are none while it is not connected, or while its watcher is silent.
+        """
+        silent = self._memory.silent(self._clock.wall_ns() - SILENT_NS)
+        if robot not in self._links.robots or robot in silent:
+            return {}
+        return {key: one.record for key, one in self._memory.standing(robot).items()}
+
     def add(self, kind: Kind, robot: str, data: Any, owner: str = "") -> None:
         """Store a change and wake its listeners."""
         self._wake([self.ring.add(kind, robot, data, time.monotonic(), owner)])
@@ -452,6 +479,8 @@ class Feed:
         yield "job", lambda c: self.add("job", c.robot, dict(c.data), str(c.data.get("owner", "")))
         yield "fetch", lambda c: self.add("fetch", c.robot, {"id": c.data["id"]})
         yield "diagnosis", lambda c: self.add("diagnosis", c.robot, [dict(c.data)])
+        yield from ((kind, self._command) for kind in ("command", "answered", "lease"))
+        yield "run", lambda c: self.add("run", c.robot, {"id": c.data["id"]})
 
     def _load(self) -> None:
         with self._database.reading() as connection:
@@ -463,6 +492,9 @@ class Feed:
             if data:
                 self.add(kind, robot, data)  # type: ignore[arg-type]  # one of two literals
         self._repeated.add(robot)
+        if any(row.channel == channels.COMMAND for row in rows):
+            self._reported.add(robot)
+            self._plan()
         now_ns = self._clock.wall_ns()
         changed = self._memory.changed(robot, change.data["store_id"], rows, now_ns)
         if changed:
@@ -479,11 +511,13 @@ class Feed:
     def _flush(self) -> None:
         self._is_due, self._last_s = False, time.monotonic()
         pending, self._pending = self._pending, {}
+        reported, self._reported = self._reported, set()
         added = [
             self.ring.add(kind, robot, data, self._last_s)
             for robot, changed in pending.items()
             for kind, data in statuses_data(changed)
         ]
+        added += [self.ring.add("command", one, {"ids": []}, self._last_s) for one in reported]
         self._wake(added)
 
     def _wake(self, deltas: Sequence[Delta]) -> None:
@@ -508,6 +542,11 @@ class Feed:
     def _robots_of(self, number: int) -> list[str]:
         with self._database.reading() as connection:
             return [row["robot"] for row in robots_of(connection, [number])[number]]
+
+    def _command(self, change: ServerChange) -> None:
+        """Publish that commands of a robot, or who may give them, have changed."""
+        if change.robot:
+            self.add("command", change.robot, {"ids": list(change.data.get("ids", ()))})
 
     def _values(self, change: ServerChange) -> None:
         self.live.take(change.robot, change.data["values"])

@@ -22,7 +22,8 @@ from amberbox.server.accounts.tokens import find_token
 from amberbox.server.database import ServerDatabase
 
 Kind: TypeAlias = Literal[
-    "presence", "status", "levels", "ages", "event", "diagnosis", "alarm", "job", "fetch"
+    "presence", "status", "levels", "ages", "event", "diagnosis", "alarm", "job", "fetch",
+    "command", "run",
 ]  # fmt: skip
 KINDS: Final[frozenset[str]] = frozenset(get_args(Kind))
 # The kinds of changes of a subscription that names none
@@ -130,6 +131,8 @@ _NEEDS = {
     "alarm": "alarms.read",
     "job": "data.download",
     "fetch": "data.query",
+    "command": "commands.read",
+    "run": "experiments.read",
 }
 
 

@@ -26,12 +26,17 @@ from amberbox.server.bus import EventBus
 from amberbox.server.config import ServerSettings
 from amberbox.server.data.downloads import DownloadService
 from amberbox.server.database import ServerDatabase
+from amberbox.server.experiments.judge import RunJudge
+from amberbox.server.experiments.robot_runs import RobotRuns
+from amberbox.server.experiments.runner import ExperimentRunner
 from amberbox.server.ingest.fetches import FetchService
 from amberbox.server.ingest.folders import FolderService
 from amberbox.server.ingest.link_server import LinkServer, SessionRevocation
 from amberbox.server.ingest.uploads import UploadService
 from amberbox.server.knowledge.explanations import Explained
+from amberbox.server.learning.models import LearningService
 from amberbox.server.live.feed import Feed
+from amberbox.server.record_orders import RecordOrders
 from amberbox.server.system import SystemLevel
 from amberbox.server.workers.pool import RequestThreads, WorkerPool
 
@@ -40,6 +45,10 @@ class NotFoundError(AmberboxError):
     """A thing that does not exist, or that the caller may not see: 404, with the same text for
     both.
     """
+
+
+class NotNowError(AmberboxError):
+    """A robot that is away, or does not allow this as it is now: 409."""
 
 
 class Demonstration(Protocol):
@@ -68,6 +77,14 @@ class Demonstration(Protocol):
     def repair(self, robot: str) -> None:
         """Let a robot be well again; raises UsageError for an unknown one."""
 
+    def codes_at_robots(self) -> Mapping[str, str]:
+        """Return the code that is shown at each robot where a motion waits for confirmation."""
+
+    def confirm(self, robot: str) -> None:
+        """Confirm the motion that waits at a robot, as somebody there; raises UsageError if none
+        does.
+        """
+
     def end(self) -> None:
         """Handle the coming end of the server: robots may end as well."""
 
@@ -92,9 +109,14 @@ class Services:
     """Unpacks and reads data of robots, and explains diagnoses in advance."""
     explained: Explained
     jobs: DownloadService
+    learning: LearningService
     fetches: FetchService
     alarms: Alarms
+    record_orders: RecordOrders
     feed: Feed
+    runner: ExperimentRunner
+    judge: RunJudge
+    robot_runs: RobotRuns
     system: SystemLevel
     keeping: ArchiveMaintenance
     revocation: SessionRevocation

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from amberbox.core.api import DiagnosisLine
+from amberbox.core.api import DiagnosisLine, ModelLine
+from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.report.serialiser import diagnosis_json, to_json
 from amberbox.server.accounts.robots import KnownRobot
+from amberbox.server.bus import ServerChange
 from amberbox.server.ingest.folders import KnownFolder
+from amberbox.server.knowledge import explanations
 from amberbox.server.knowledge.diagnoses import DiagnosisHistory
 from amberbox.server.knowledge.questions import (
     LIMIT_S,
     MEMORY_BYTES,
+    MODELS_WORKER,
     WORKER,
+    AskDiagnosis,
+    AskModel,
     RobotQuestion,
     encode_question,
 )
@@ -33,12 +41,94 @@ async def read_fmea(
     return decode_answer(await ask_worker(fleet, who, "fmea", asked))
 
 
-async def ask_worker(fleet: Services, who: Caller, name: str, asked: RobotQuestion) -> bytes:
+async def ask_worker(
+    fleet: Services, who: Caller, name: str, asked: RobotQuestion, worker: str = WORKER
+) -> bytes:
     """Let a worker answer a question about a robot; return its JSON."""
-    op = f"{WORKER}:{name}"
+    op = f"{worker}:{name}"
     return await fleet.worker_pool.ask(
         op, encode_question(asked), LIMIT_S, MEMORY_BYTES, origin=who.person
     )
+
+
+async def list_models(
+    fleet: Services, who: Caller, robot: KnownRobot, at: str = "", config_hash: str = ""
+) -> list[ModelLine]:
+    """Return the models of a robot's folder, and what is wrong with them."""
+    asked = RobotQuestion(
+        robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at, config_hash=config_hash
+    )
+    found = await ask_worker(fleet, who, "listed", asked, MODELS_WORKER)
+    return [ModelLine(**line) for line in json.loads(found)]
+
+
+async def ask_model(
+    fleet: Services, who: Caller,
+    name: Literal["structure", "consistency", "components", "residual"], asked: AskModel,
+) -> dict[str, Any]:  # fmt: skip
+    """Return what a worker answers about a model."""
+    return decode_answer(await ask_worker(fleet, who, name, asked, MODELS_WORKER))
+
+
+_TRIES = 5
+"""Number of times an answer is ranked again because another person has answered meanwhile."""
+
+
+async def answer_tests(
+    fleet: Services, who: Caller, robot: str, diagnosis: str, test: str, words: Mapping[str, str],
+    details: Mapping[str, Any] | None = None,
+) -> bytes:  # fmt: skip
+    """Store answers to tests of a diagnosis and rank it anew; return the new ranking, JSON.
+
+    ``test`` is the first of ``words``, answers by test. The robot is told as well. Raises
+    UsageError where others answer all the time.
+    """
+    for _ in range(_TRIES):
+        before = await asyncio.to_thread(given_answers, fleet, robot, diagnosis)
+        asked = AskDiagnosis(robot=robot, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
+                             answers={**before, **words})  # fmt: skip
+        answer = await ask_worker(fleet, who, "diagnose", asked)
+        about = {"diagnosis": diagnosis, "test": test, "answer": words[test], **(details or {})}
+        kept = await asyncio.to_thread(
+            _keep_answers, fleet, who, robot, about, words, before, answer
+        )  # fmt: skip
+        if kept is not None:
+            if kept:
+                fleet.bus.publish(ServerChange("command", robot, {"ids": []}))
+            fleet.bus.publish(ServerChange("diagnosis", robot, {"id": diagnosis}))
+            return answer
+    raise UsageError("others answer tests of this diagnosis just now", "try again")
+
+
+def given_answers(fleet: Services, robot: str, diagnosis: str) -> dict[str, str]:
+    """Return the last answer to each test of a diagnosis."""
+    with fleet.database.reading() as connection:
+        return explanations.latest_by_test(explanations.read_answers(connection, robot, diagnosis))
+
+
+def _keep_answers(
+    fleet: Services, who: Caller, robot: str, about: Mapping[str, Any], words: Mapping[str, str],
+    before: Mapping[str, str], answer: bytes,
+) -> bool | None:  # fmt: skip
+    """Store answers and the new ranking; return whether the robot is told.
+
+    None, and nothing is stored, if another answer was stored since ``before``.
+    """
+    now_ns, person, diagnosis = fleet.clock.wall_ns(), who.person, str(about["diagnosis"])
+    others = {test: word for test, word in words.items() if test != about["test"]}
+    given, *also = [
+        explanations.GivenAnswer(test, word, person, now_ns)
+        for test, word in {about["test"]: about["answer"], **others}.items()
+    ]
+    with fleet.database.begin() as connection:
+        known = explanations.read_answers(connection, robot, diagnosis)
+        if explanations.latest_by_test(known) != before:
+            return None
+        explanations.keep_answer(connection, robot, diagnosis, given, answer, also)
+        is_told = explanations.send_answers(connection, now_ns, robot, diagnosis, [given, *also])
+        details = {**about, **({"also": others} if others else {})}
+        who.note(connection, now_ns, "diagnoses.answer", robot, details=details)
+    return is_told
 
 
 @dataclass(frozen=True, slots=True)

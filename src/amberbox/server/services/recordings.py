@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from sqlalchemy import Connection
 from amberbox.blackbox.retention.missions import RecordedMission as KnownMission
 from amberbox.blackbox.retention.missions import choose
 from amberbox.core.api import (
+    CommandLine,
     Download,
     Fetch,
     FetchedJournal,
@@ -21,16 +23,31 @@ from amberbox.core.api import (
     MomentNote,
     Note,
 )
+from amberbox.core.errors import UsageError
+from amberbox.core.notes import RecordedNote
+from amberbox.core.record_commands import (
+    IncidentMark,
+    IncidentRelease,
+    JournalCopy,
+    JournalRotate,
+    RecordCommand,
+)
 from amberbox.core.timestamps import format_time, maybe_time
 from amberbox.server import annotations as server_annotations
+from amberbox.server import commands, record_orders
 from amberbox.server.accounts.permissions import Role
 from amberbox.server.accounts.robots import KnownRobot
-from amberbox.server.annotations import MarkedIncident, MomentAnnotation
+from amberbox.server.annotations import MarkedIncident, StoredNote
+from amberbox.server.bus import ServerChange
+from amberbox.server.commands import StoredCommand
 from amberbox.server.data import downloads
 from amberbox.server.data.downloads import DownloadJob
 from amberbox.server.data.query import WORKER, RowQuery, arguments
-from amberbox.server.ingest import fetches
+from amberbox.server.ingest import fetches, link_state
 from amberbox.server.ingest.fetches import RequestedWindow
+from amberbox.server.ingest.uploads import copies_of, copy_matter, is_sound
+from amberbox.server.record_orders import RecordOrder
+from amberbox.server.services.commands import command_line
 from amberbox.server.services.context import Caller, Services, robot_span_ns
 
 _BEYOND_NS = 2**63
@@ -90,11 +107,78 @@ def list_notes(
     return [note_line(one) for one in found]
 
 
-def note_line(one: MomentAnnotation) -> MomentNote:
-    """Return a note on a moment in its published form."""
+def note_line(one: StoredNote) -> MomentNote:
+    """Return a note in its published form."""
+    note = one.note
     return MomentNote(
-        id=one.number, at=format_time(one.at_ns), who=one.who, text=one.text, mission=one.mission
-    )
+        id=one.number, at=format_time(note.at_ns), who=note.who, text=note.text,
+        mission=note.mission, note=note.id, to=maybe_time(note.to_ns), about=note.about,
+        revision=note.revision,
+    )  # fmt: skip
+
+
+def write_note(
+    fleet: Services, who: Caller, robot: KnownRobot, text: str, at: str = "", to: str = "",
+    about: str = "", mission: str = "",
+) -> MomentNote:  # fmt: skip
+    """Write a note on a moment, a range or a mission, here and into the robot's record.
+
+    Times are the robot's, as its data are; ``now`` is the server's. Raises UsageError.
+    """
+    at_ns, to_ns = robot_span_ns(fleet, robot.id, at, to)
+    with fleet.database.begin() as connection:
+        now_ns, by = fleet.clock.wall_ns(), str(who.principal)
+        if at_ns is None:
+            at_ns = now_ns - (link_state.clock_offset_ns(connection, robot.id) or 0)
+        if to_ns is not None and to_ns <= at_ns:
+            raise UsageError("the range ends before it begins", "exchange at and to")
+        note = _checked(
+            RecordedNote(
+                f"note-{secrets.token_hex(8)}", at_ns, record_orders.person_label(by), text, to_ns,
+                about, mission, written_ns=now_ns,
+            )
+        )  # fmt: skip
+        made = server_annotations.annotate(connection, robot.id, note)
+        action = "missions.annotate" if mission else "notes.add"
+        details = {"id": mission or made.number, "at": format_time(at_ns), "text": text}
+        who.note(connection, now_ns, action, robot.id, details=details)
+        is_sent = server_annotations.send_note(connection, now_ns, robot.id, note)
+    _publish(fleet, robot.id, is_sent=is_sent)
+    return note_line(made)
+
+
+def change_note(
+    fleet: Services, who: Caller, robot: KnownRobot, uid: str, text: str = "", *,
+    withdrawn: bool = False,
+) -> MomentNote:  # fmt: skip
+    """Change the text of a note, or withdraw it, here and in the robot's record.
+
+    Raises UsageError for a note that does not exist or is withdrawn.
+    """
+    with fleet.database.begin() as connection:
+        now_ns, by = fleet.clock.wall_ns(), str(who.principal)
+        known = server_annotations.find_note(connection, robot.id, uid)
+        if known is None or known.note.withdrawn:
+            raise UsageError(f"there is no note '{uid}' of {robot.id}")
+        note = _checked(
+            msgspec.structs.replace(
+                known.note, text=text or known.note.text, who=record_orders.person_label(by),
+                revision=known.note.revision + 1, withdrawn=withdrawn, written_ns=now_ns,
+            )
+        )  # fmt: skip
+        server_annotations.change_note(connection, robot.id, note)
+        action = "notes.withdraw" if withdrawn else "notes.change"
+        who.note(connection, now_ns, action, robot.id, details={"id": uid, "text": text})
+        is_sent = server_annotations.send_note(connection, now_ns, robot.id, note)
+    _publish(fleet, robot.id, is_sent=is_sent)
+    return note_line(StoredNote(known.number, note))
+
+
+def _checked(note: RecordedNote) -> RecordedNote:
+    try:
+        return msgspec.convert(msgspec.structs.asdict(note), RecordedNote)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"this is no note: {error}") from error
 
 
 def list_incidents(
@@ -108,9 +192,9 @@ def list_incidents(
     )
     incidents = [_of_robot(values) for values in msgspec.json.decode(answer)]
     with fleet.database.reading() as connection:
-        incidents += [
-            marked_incident(one) for one in server_annotations.incidents(connection, robot.id)
-        ]
+        marked = server_annotations.incidents(connection, robot.id)
+        orders = record_orders.found(connection, robot.id, [_about(one.id) for one in marked])
+    incidents += [marked_incident(one, orders.get(_about(one.id))) for one in marked]
     low, high = (None if ns is None else format_time(ns) for ns in (from_ns, to_ns))
     found = [
         one for one in incidents
@@ -136,13 +220,145 @@ def _time(value: object) -> str:
     return format_time(value if isinstance(value, int) and abs(value) < _BEYOND_NS else 0)
 
 
-def marked_incident(one: MarkedIncident) -> Incident:
+def mark_incident(
+    fleet: Services, who: Caller, robot: KnownRobot, from_: str, to: str, reason: str
+) -> Incident:
+    """Mark a window, here and on the robot, where it is pinned in the ring as well.
+
+    A window is in the robot's time, as its data are; ``now`` is the server's. Raises UsageError for
+    a window without beginning or end.
+    """
+    from_ns, to_ns = robot_span_ns(fleet, robot.id, from_, to)
+    if from_ns is None or to_ns is None:
+        raise UsageError("a window has a beginning and an end", "give from and to")
+    with fleet.database.begin() as connection:
+        now_ns, by = fleet.clock.wall_ns(), str(who.principal)
+        marked = server_annotations.mark(connection, now_ns, robot.id, (from_ns, to_ns), reason, by)
+        details = {"id": marked.id, "from": format_time(from_ns), "to": format_time(to_ns),
+                   "reason": reason}  # fmt: skip
+        who.note(connection, now_ns, "incidents.mark", robot.id, details=details)
+        ahead_ns = link_state.clock_offset_ns(connection, robot.id) or 0
+        start_ns, end_ns = (
+            ns - ahead_ns if text.strip().startswith("now") else ns
+            for text, ns in ((from_, from_ns), (to, to_ns))
+        )
+        who_label = record_orders.person_label(by)
+        wanted = IncidentMark(marked.id, start_ns, end_ns, who_label, reason)
+        about = _about(marked.id)
+        is_sent = record_orders.order(connection, now_ns, robot.id, about, wanted, by)
+        order = record_orders.find(connection, robot.id, about)
+    _publish(fleet, robot.id, is_sent=is_sent)
+    return marked_incident(marked, order)
+
+
+def release_incident(fleet: Services, who: Caller, robot: KnownRobot, id: str) -> Incident:
+    """Release a window that was marked here, on the robot, too; raises UsageError."""
+    with fleet.database.begin() as connection:
+        now_ns, about = fleet.clock.wall_ns(), _about(id)
+        released = server_annotations.release(connection, now_ns, robot.id, id)
+        who.note(connection, now_ns, "incidents.release", robot.id, details={"id": id})
+        is_sent, before = False, record_orders.find(connection, robot.id, about)
+        if before is not None and before.state != "refused":
+            by = str(who.principal)
+            wanted = IncidentRelease(id, record_orders.person_label(by))
+            is_sent = record_orders.order(connection, now_ns, robot.id, about, wanted, by)
+        order = record_orders.find(connection, robot.id, about)
+    _publish(fleet, robot.id, is_sent=is_sent)
+    return marked_incident(released, order)
+
+
+def _publish(fleet: Services, robot: str, *, is_sent: bool) -> None:
+    fleet.bus.publish(ServerChange("robot", robot))
+    if is_sent:
+        fleet.bus.publish(ServerChange("command", robot, {"ids": []}))
+
+
+def _about(incident: str) -> str:
+    return f"incident:{incident}"
+
+
+def _on_robot(order: RecordOrder | None) -> str:
+    """Return what a robot does with an incident of the server."""
+    if order is None or order.state == "withdrawn":
+        return ""
+    if order.state in ("waiting", "sent", "accepted"):
+        return "asked"
+    if order.state != "done":
+        return f"{order.state}: {order.reason}" if order.reason else order.state
+    return "pinned" if isinstance(order.wanted, IncidentMark) else "released"
+
+
+def marked_incident(one: MarkedIncident, order: RecordOrder | None = None) -> Incident:
     """Return a window that was marked on the server in its published form."""
     return Incident(
         id=one.id, origin="server", state="complete" if one.released_ns is None else _RELEASED,
         reason=one.reason, who=one.who, trigger="", from_=format_time(one.from_ns),
-        to=format_time(one.to_ns),
+        to=format_time(one.to_ns), on_robot=_on_robot(order),
     )  # fmt: skip
+
+
+def copy_again(
+    fleet: Services, who: Caller, robot: KnownRobot, journal: str, store_id: str = ""
+) -> CommandLine:
+    """Let a robot send a journal again that is damaged, missing or quarantined here.
+
+    ``store_id`` is that of the robot's present store if it is empty. Raises UsageError where the
+    copy here is what the robot has signed, or the robot cannot send it.
+    """
+    with fleet.database.begin() as connection:
+        now_ns, present = fleet.clock.wall_ns(), link_state.store_of(connection, robot.id)
+        if not present or (store_id and store_id != present):
+            raise UsageError(f"{robot.id} has another store now", "what is in it is listed")
+        sha256 = _expected_sha256(connection, fleet, robot.id, present, journal)
+        wanted, about = JournalCopy(journal, sha256), copy_matter(present, journal)
+        command = _order(connection, now_ns, robot.id, about, wanted, who)
+        details = {"journal": journal, "command": command.id}
+        who.note(connection, now_ns, "recordings.copy", robot.id, details=details)
+    _publish(fleet, robot.id, is_sent=True)
+    return command_line(command)
+
+
+def _expected_sha256(
+    connection: Connection, fleet: Services, robot: str, store_id: str, journal: str
+) -> str:
+    """Return the content that a journal has to have; empty for one that was not verified."""
+    held = copies_of(connection, robot, store_id, journal)
+    if not held:
+        raise UsageError(f"the server has never had {journal}", "it is copied by itself")
+    verified = next((one for one in held if one.state == "verified"), None)
+    if verified is None:
+        return ""
+    if verified.raw_gone:
+        raise UsageError(f"{journal} was deleted by retention", "its columns are kept longer")
+    if is_sound(fleet.folder, verified):
+        raise UsageError(f"the copy of {journal} is what the robot has signed")
+    return str(verified.sha256)
+
+
+def rotate(fleet: Services, who: Caller, robot: KnownRobot) -> CommandLine:
+    """Let the recorder of a robot begin new files, so that the present ones can be copied."""
+    with fleet.database.begin() as connection:
+        now_ns = fleet.clock.wall_ns()
+        command = _order(connection, now_ns, robot.id, "rotate", JournalRotate(), who)
+        details = {"command": command.id}
+        who.note(connection, now_ns, "recordings.rotate", robot.id, details=details)
+    _publish(fleet, robot.id, is_sent=True)
+    return command_line(command)
+
+
+def _order(
+    connection: Connection, now_ns: int, robot: str, about: str, wanted: RecordCommand, who: Caller
+) -> StoredCommand:
+    """Order something now, or raise UsageError; return its command."""
+    is_sent = record_orders.order(connection, now_ns, robot, about, wanted, str(who.principal))
+    order = record_orders.find(connection, robot, about)
+    found = None if order is None else commands.find(connection, now_ns, order.command)
+    if not is_sent or found is None:
+        raise UsageError(
+            f"{robot} takes no such commands, or too many wait for it",
+            "amberbox run on the robot takes them; look at its commands",
+        )
+    return found
 
 
 def list_gaps(

@@ -23,7 +23,8 @@ from amberbox.server.services.context import NotFoundError, Services
 from amberbox.server.settings import LOST
 
 _LONGEST_S = 1e10
-_CLASSES = ("*", OWN, "main", "bulk", "ring", "watch", "keep", "kept")
+_CLASSES = ("*", OWN, "main", "bulk", "ring", "watch", "keep", "kept", "act",
+            "experiment", "detect")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from amberbox.server.http.auth import Fleet, InDemo, Open, Who, address_of, is_h
 from amberbox.server.http.errors import status_of
 from amberbox.server.services.context import Services
 from amberbox.server.services.people import list_sessions, list_tokens
-from amberbox.server.web.page import PageRoutes, render, visitor
+from amberbox.server.web.page import PageRoutes, is_own_path, render, visitor
 from amberbox.server.web.text import catalogue
 
 _BROWSERS = (
@@ -66,7 +66,7 @@ routes = PageRoutes()
 def show_account(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show one's own account; only the password form if the password has to be changed first."""
     more = {} if who.principal.must_change else _more(fleet, who)
-    return render(request, "account/account.html", **more)
+    return render(request, "account/account.html", strings=("commands",), **more)
 
 
 def _more(fleet: Services, who: Who) -> Mapping[str, Any]:
@@ -75,27 +75,16 @@ def _more(fleet: Services, who: Who) -> Mapping[str, Any]:
         teams = list_groups(connection) if mine is None else sorted(mine)
     tokens = [token for token in list_tokens(fleet, who.principal.id) if token.revoked is None]
     return {"sessions": list_sessions(fleet, who), "tokens": tokens, "scopes": SCOPES,
-            "teams": teams, "device": device}  # fmt: skip
-
-
-_PATH = re.compile(r"/(?![/\\])[^\x00-\x20\\\x7f]*")
+            "teams": teams, "device": device, "server_id": fleet.links.server_id}  # fmt: skip
 
 
 @routes.get("/sign-in", Open("asks for name and password; shows nothing"))
 def show_signin(request: Request, next: str = "/") -> Response:
     """Show the sign-in form; redirect a person who is signed in to the page ``next``."""
-    onward = next if _is_here(next) else "/"
+    onward = next if is_own_path(next) else "/"
     if visitor(request) is not None:
         return RedirectResponse(onward, 303)
     return render(request, "account/signin.html", onward=onward)
-
-
-def _is_here(address: str) -> bool:
-    """Return whether an address is a path of this server, so that it is safe to redirect to.
-
-    Browsers drop tabs and line ends, and read a backslash as a slash.
-    """
-    return _PATH.fullmatch(address) is not None
 
 
 @routes.get("/in", Open("signs in by a link, in a demonstration; 404 anywhere else"))

@@ -23,6 +23,7 @@ from amberbox.server.live.links import damaged_files
 from amberbox.server.schema import AUDIT
 from amberbox.server.services.alarms import list_notifications
 from amberbox.server.services.audit import list_rows, read_head
+from amberbox.server.services.commands import list_revoked_keys
 from amberbox.server.services.context import Caller, Services
 from amberbox.server.services.health import (
     families,
@@ -43,7 +44,8 @@ routes = PageRoutes()
 _MOST = 1000
 PAGES = (
     ("users", "person", "users.read"), ("teams", "graph", "users.read"),
-    ("robots", "robot", "robots.write"), ("retention", "tape", "retention.write"),
+    ("robots", "robot", "robots.write"), ("keys", "key", "keys.write"),
+    ("retention", "tape", "retention.write"),
     ("notifications", "bell", "settings.write"), ("alarms", "time", "settings.write"),
     ("downloads", "download", "settings.write"), ("audit", "note", "audit.read"),
     ("health", "heart", "metrics.read"), ("system", "box", "status.read"),
@@ -109,6 +111,12 @@ def show_robots(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show the robots that may connect, and signing keys that wait for confirmation."""
     return render(request, "admin/robots.html", cards=list_cards(fleet, who, "", "", _MOST),
                   teams=_teams(fleet), waiting_keys=list_waiting_keys(fleet))  # fmt: skip
+
+
+@routes.get("/admin/keys", "keys.write")
+def show_keys(request: Request, fleet: Fleet) -> Response:
+    """Show the keys of people that are revoked, and the form that revokes one."""
+    return render(request, "admin/keys.html", keys=list_revoked_keys(fleet)[::-1])
 
 
 def _teams(fleet: Services) -> list[str]:

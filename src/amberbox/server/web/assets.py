@@ -14,6 +14,7 @@ from posixpath import dirname, join, normpath
 
 from fastapi import HTTPException, Request, Response
 
+from amberbox.experiments.drawing import RULES
 from amberbox.server.http.auth import Open, Routes
 
 _PATH = r'"(\.{1,2}/[\w/-]+\.js)";'
@@ -154,6 +155,7 @@ def _styles() -> Iterator[bytes]:
     yield from ((folder / name).read_bytes() for name in _FIRST)
     yield uplot("uplot.min.css")
     yield from ((folder / name).read_bytes() for name in rest)
+    yield RULES.encode()  # of diagrams, which are the same on pages and in files
 
 
 routes = Routes(prefix="")

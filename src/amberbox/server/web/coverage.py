@@ -37,7 +37,7 @@ _MOST: Window = "7d"
 _STEPS = 800
 """Stretches nearer to each other than this part of the bar are drawn as one."""
 _HOUR_NS = 3600 * NS
-ASIDE = ("watch", "keep")
+ASIDE = ("watch", "keep", "act", "experiment", "detect")
 """Journals of the box and its watcher, which are not coverage of the robot's data."""
 _HELD = ("in_columns", "waiting")
 _DRAWN: Mapping[GapKind, Kind] = {

@@ -34,7 +34,12 @@ from amberbox.server.knowledge.questions import (
     SymptomWord,
 )
 from amberbox.server.services.context import Caller, Services
-from amberbox.server.services.knowledge import ask_worker, diagnosis_line, revision_json
+from amberbox.server.services.knowledge import (
+    ask_worker,
+    diagnosis_line,
+    list_models,
+    revision_json,
+)
 from amberbox.server.services.robots import current_status, read_card
 from amberbox.server.web.diagnosis_card import (
     CardNextStep,
@@ -303,6 +308,11 @@ def _revisions(known: DiagnosisHistory | None) -> list[Values]:
     ]  # fmt: skip
 
 
+async def models(asked: DiagnosisRequest, robot: KnownRobot) -> Values:
+    """Return the models of the robot's folder."""
+    return {"models": await list_models(asked.fleet, asked.who, robot, asked.at)}
+
+
 CUT_SETS = 300
 """Number of sets that are evaluated, those with the fewest failures first."""
 PATTERNS = 20
@@ -333,8 +343,9 @@ async def tree(asked: DiagnosisRequest, effect: str) -> Values:
     label = catalogue().text("diagnosis.details.tree.label", text=found["description"] or chosen)
     return {
         "effects": every["functions"], "chosen": chosen, "tree": found, "notes": found["notes"],
-        "chance": _small(found["top_probability"]), "closest": _named(near, texts),
+        "chance": _chance(found), "closest": _named(near, texts),
         "important": _important(found, texts), "patterns": _patterns(found["cut_sets"], texts),
+        "probable": _probable(found, texts),
         "drawing": fault_tree(
             shown, label=label, depth=DEPTH, most=PLACES, cut_set=_happened(near),
             words=drawing_words(),
@@ -392,6 +403,34 @@ def _important(found: Mapping[str, Any], texts: Mapping[str, str]) -> list[Value
     ranked = sorted((found["importance"] or {}).items(), key=lambda item: -(item[1]["cif"] or 0))
     return [{"text": texts.get(name, name), "share": percent(of["cif"] or 0)}
             for name, of in ranked[:IMPORTANT]]  # fmt: skip
+
+
+def _chance(found: Mapping[str, Any]) -> str:
+    """Return the probability, or its two bounds where it is not known exactly."""
+    exact, bounds = found["top_probability"], found["probability_bounds"]
+    if exact is not None or bounds is None:
+        return _small(exact)
+    low, high = (f"{value:.3g}" for value in bounds)
+    return catalogue().text("diagnosis.details.tree.between", low=low, high=high)
+
+
+def _probable(found: Mapping[str, Any], texts: Mapping[str, str]) -> Values | None:
+    """Return the most probable cut sets of a tree that is too large, and their share."""
+    best = found.get("most_probable")
+    if best is None or found["minimal_cut_sets"] is not None:
+        return None
+    share = best["share"]
+    return {
+        "sets": [
+            {
+                "events": [texts.get(name, name) for name in one["events"]],
+                "chance": _small(one["probability"]),
+            }
+            for one in best["cut_sets"]
+        ],
+        "low": percent(share[0]) if share else "",
+        "high": percent(share[1]) if share else "",
+    }
 
 
 def _small(value: float | None) -> str:
@@ -518,7 +557,7 @@ def _failed(entry: Answer, depth: int) -> Iterator[ProofLine]:
 
 routes = PageRoutes()
 
-TABS = ("others", "effects", "tree", "rules", "whatif", "history", "cause")
+TABS = ("others", "effects", "tree", "models", "rules", "whatif", "history", "cause")
 WORKER_TABS = ("rules", "whatif")
 """Tabs in which one asks the robot's knowledge something: for operators, as over the API."""
 
@@ -600,6 +639,15 @@ async def show_tree(
     """Return the fragment with the fault tree of one function."""
     asked = DiagnosisRequest(fleet, who, robot.id, at=at)
     return await _part(request, "tree", asked, robot, tree(asked, effect))
+
+
+@routes.get("/robots/{robot}/diagnosis/models", "diagnoses.read")
+async def show_models(
+    request: Request, robot: OfRobot, fleet: Fleet, who: Who, at: At = ""
+) -> Response:
+    """Return the fragment with the models of the robot's folder."""
+    asked = DiagnosisRequest(fleet, who, robot.id, at=at)
+    return await _part(request, "models", asked, robot, models(asked, robot))
 
 
 @routes.get("/robots/{robot}/diagnosis/history", "diagnoses.read")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
+from urllib.parse import quote, urlencode
 
 from fastapi import HTTPException
 
@@ -37,6 +39,7 @@ from amberbox.server.knowledge.diagnoses import (
 from amberbox.server.knowledge.explanations import Answer as explanations_Answer
 from amberbox.server.knowledge.explanations import latest_answer
 from amberbox.server.live.status import AssessedRobot as Now
+from amberbox.server.services.commands import remedies
 from amberbox.server.services.context import Caller, Services
 from amberbox.server.services.knowledge import revision_json
 from amberbox.server.web.text import catalogue, moment_href, span
@@ -44,6 +47,7 @@ from amberbox.server.web.text import catalogue, moment_href, span
 REASONS = 3
 """Number of sentences under "Why"."""
 CANNOT = "cannot"
+_RECOVERIES = 6
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
 State: TypeAlias = Literal["open", "healed", "gone", "past", "none"]
@@ -142,7 +146,8 @@ class CardNextStep:
     """The next step; without ``test`` there is nothing to answer.
 
     ``make_safe`` are actions before it, in the words of the robot's FMEA. ``about`` are the failure
-    modes that the test concerns.
+    modes that the test concerns. ``run`` is the name of the experiment or unit test (``kind``) that
+    the test is.
     """
 
     text: str
@@ -154,6 +159,16 @@ class CardNextStep:
     remedies: Sequence[str] = ()
     make_safe: Sequence[SafetyAction] = ()
     about: frozenset[str] = frozenset()
+    kind: str = ""
+    run: str = ""
+
+    def run_href(self, robot: str, diagnosis: str) -> str:
+        """Return the page that starts the run; its verdict answers the test."""
+        about = {"diagnosis": diagnosis, "test": self.test}
+        page = f"/robots/{quote(robot, '')}/experiments"
+        if self.kind == "unit_test":
+            return f"{page}?{urlencode({**about, 'unit_test': self.run})}#unit-tests"
+        return f"{page}/{quote(self.run, '')}?{urlencode(about)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +183,7 @@ class DiagnosisCard:
     intermittent. ``number`` is the probability as text, empty if there is none. ``names`` are the
     names of failure modes and ``helps`` their remedies, by id; ``shares`` are the hypotheses with
     their probabilities. ``status`` is the present status of the robot, None on cards that are not
-    about the present.
+    about the present. ``recoveries`` are actions that the robot says to be remedies.
     """
 
     robot: str
@@ -197,6 +212,7 @@ class DiagnosisCard:
     shares: Sequence[tuple[frozenset[str], float]] = ()
     seen: Sequence[CardReason] = ()
     status: RobotStatus | None = None
+    recoveries: Sequence[str] = ()
 
     def having(self, seen: Iterable[CardReason]) -> DiagnosisCard:
         """Return it with symptoms: those still present first, then by weight."""
@@ -469,7 +485,7 @@ def _next_of(step: Answer, tests: Sequence[Answer]) -> CardNextStep:
         choices_of({}, step) if step["test"] else (),
         tuple(sentence(text) for text in step["remedies"]),
         tuple(_safety(action) for action in safe),
-        frozenset(step.get("about", ())),
+        frozenset(step.get("about", ())), step.get("kind", ""), step.get("run", ""),
     )  # fmt: skip
 
 
@@ -486,7 +502,8 @@ def _plain_next(tests: Sequence[Answer], safe: Sequence[str]) -> CardNextStep | 
         return CardNextStep("", make_safe=actions) if actions else None
     test = tests[0]
     return CardNextStep(sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
-                choices=choices_of(test), make_safe=actions)  # fmt: skip
+                choices=choices_of(test), make_safe=actions,
+                kind=test["kind"], run=test.get("run") or "")  # fmt: skip
 
 
 def _in_order(choices: Sequence[Choice]) -> tuple[Choice, ...]:
@@ -575,7 +592,7 @@ def card_now(fleet: Services, seen: DiagnosisView, now: Now | None = None) -> Di
     answer = _at_hand(fleet, seen)
     known = seen.known
     card = _plain(seen, known) if answer is None else _card(answer, seen, known)
-    return _timed(card, seen, known, now, fleet.clock.wall_ns())
+    return _with_recoveries(fleet, _timed(card, seen, known, now, fleet.clock.wall_ns()))
 
 
 async def explained_card(
@@ -585,7 +602,19 @@ async def explained_card(
     if seen.known is None or not seen.stands:
         return _nothing(seen, now)
     card = _card(await read_explanation(fleet, who, seen), seen, seen.known)
-    return _timed(card, seen, seen.known, now, fleet.clock.wall_ns())
+    timed = _timed(card, seen, seen.known, now, fleet.clock.wall_ns())
+    return await asyncio.to_thread(_with_recoveries, fleet, timed)
+
+
+def _with_recoveries(fleet: Services, card: DiagnosisCard) -> DiagnosisCard:
+    """Return a card with the actions that the robot says to be remedies of its causes."""
+    if card.state != "open":
+        return card
+    known = remedies(fleet, card.robot)
+    faults = [id_ for cause in card.causes for id_ in cause.id.split()]
+    found = [name for id_ in faults for key in (id_, id_.partition("#")[0])
+             for name in known.get(key, ())]  # fmt: skip
+    return replace(card, recoveries=tuple(dict.fromkeys(found))[:_RECOVERIES])
 
 
 async def read_explanation(

@@ -15,6 +15,7 @@ from amberbox.core.api import Card
 from amberbox.core.robot_status import worst
 from amberbox.core.types import Level
 from amberbox.server.http.auth import Fleet, OfRobot, Open, Who
+from amberbox.server.services.commands import list_unsigned
 from amberbox.server.services.context import Services
 from amberbox.server.services.health import SystemFolder, read_health, read_system
 from amberbox.server.services.robots import list_cards, read_card
@@ -59,7 +60,9 @@ def show(
 ) -> Response:  # fmt: skip
     """Show the robots, and the state of the system."""
     look = HomeQuery(q, show, sort, by)
-    return render(request, "home.html", **_listed(fleet, who, look), system=_system(fleet, who))
+    unsigned = len(list_unsigned(fleet, who))
+    return render(request, "home.html", **_listed(fleet, who, look), system=_system(fleet, who),
+                  unsigned=unsigned)  # fmt: skip
 
 
 @routes.get("/pieces/robots", "status.read", each=True)

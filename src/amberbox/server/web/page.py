@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -28,8 +29,17 @@ from amberbox.core.timestamps import format_time
 from amberbox.core.version import __version__
 from amberbox.diagnosis.report.wording import capitalize, readable, sentence
 from amberbox.server.accounts.sessions import csrf_token
+from amberbox.server.experiments import runs
+from amberbox.server.experiments.runs import HOLDING, StoredRun
 from amberbox.server.http import errors as api
-from amberbox.server.http.auth import Decorator, Open, Routes, caller_of, services_of
+from amberbox.server.http.auth import (
+    FORM_TYPE,
+    Decorator,
+    Open,
+    Routes,
+    caller_of,
+    services_of,
+)
 from amberbox.server.live.status import is_open
 from amberbox.server.schema import ALARM, ALARM_ROBOT
 from amberbox.server.services.context import Caller, Services
@@ -78,6 +88,12 @@ class PageRoutes(Routes):
             path, action, each=each, include_in_schema=False, response_class=HTMLResponse, **more
         )
 
+    def form(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:
+        """Add a page that answers a plain form."""
+        return super().form(
+            path, action, each=each, include_in_schema=False, response_class=HTMLResponse, **more
+        )
+
 
 def render(request: Request, template: str, status: int = 200, **values: Any) -> Response:
     """Return the page of a template with ``values``.
@@ -89,6 +105,17 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
     text = environment().get_template(template).render({**known, **values})
     # pages are for one caller only: caches must revalidate them each time
     return HTMLResponse(text, status, {"Cache-Control": "private, no-cache"})
+
+
+_PATH = re.compile(r"/(?![/\\])[^\x00-\x20\\\x7f]*")
+
+
+def is_own_path(address: str) -> bool:
+    """Return whether an address is a path of this server, so that it is safe to redirect to.
+
+    Browsers drop tabs and line ends, and read a backslash as a slash.
+    """
+    return _PATH.fullmatch(address) is not None
 
 
 def visitor(request: Request) -> Caller | None:
@@ -140,10 +167,23 @@ def _about(request: Request, template: str, also: tuple[str, ...]) -> Mapping[st
         "theme": theme if theme in THEMES else "",
         "path": request.url.path,
         "now": format_time(services.clock.wall_ns()),
+        "site": services.settings.public_url,
+        "held": _held(services),
         "demo": getattr(services, "demo", None),
         "open_alarms": lambda: open_count(services, me) if me else OpenCount(),
         "browser_strings": for_browser(("common", *parts, *also)),
     }
+
+
+def _held(services: Services) -> Callable[[str], StoredRun | None]:
+    """Return a function that finds the run that holds a robot; it reads them once."""
+
+    @cache
+    def all_held() -> Mapping[str, StoredRun]:
+        with services.database.reading() as connection:
+            return {run.robot: run for run in runs.listed(connection, states=HOLDING, limit=1000)}
+
+    return lambda robot: all_held().get(robot)
 
 
 _FIRST = ("base", "robot_base", "home", "robot/")
@@ -182,7 +222,9 @@ def is_page(request: Request) -> bool:
     """Return whether a request is for a page, not for JSON."""
     method = request.scope.get("method")  # WebSockets have none
     wants_json = request.headers.get("accept", "").startswith("application/json")
-    return method == "GET" and not wants_json and not request.url.path.startswith(PROGRAMS)
+    is_form = request.headers.get("content-type", "").startswith(FORM_TYPE)
+    by_browser = method == "GET" or (method == "POST" and is_form)
+    return by_browser and not wants_json and not request.url.path.startswith(PROGRAMS)
 
 
 async def _known(request: Request, found: Exception) -> Response:

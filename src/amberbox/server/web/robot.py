@@ -34,6 +34,7 @@ from amberbox.server.drawing import charts as drawing
 from amberbox.server.drawing.charts import TimeAxis, spark
 from amberbox.server.http.auth import Fleet, OfRobot, Who
 from amberbox.server.live.records import format_moment
+from amberbox.server.services.commands import remedies
 from amberbox.server.services.context import Caller, Services, query_time_ns
 from amberbox.server.services.robots import (
     current_status,
@@ -215,7 +216,7 @@ def show(
     tree = known or status_without_folder(fleet, robot)
     may = {name: who.may(name, robot) for name in _ACTIONS}
     return _show(
-        request, "robot/robot.html", card=card, look=look, may=may, **_tree(tree, look),
+        request, "robot/robot.html", card=card, look=look, may=may, **_tree(fleet, tree, look),
         **_graph(tree), **_panels(tree, card), **_now(fleet, who, robot),
         fill=_fills(request, robot) if known is None else {},
         has_files=_has_files(fleet, who, robot, card), robot=robot,
@@ -238,7 +239,9 @@ def show_tree(
 ) -> Response:  # fmt: skip
     """Return the fragment with the tree of components."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return _show(request, "robot/tree.html", card=card, **_tree(tree, RobotQuery(q, show, chosen)))
+    return _show(
+        request, "robot/tree.html", card=card, **_tree(fleet, tree, RobotQuery(q, show, chosen))
+    )
 
 
 @routes.get("/pieces/robots/{robot}/graph", "status.read")
@@ -302,9 +305,12 @@ def _show(request: Request, template: str, **shown: Any) -> Response:
     return render(request, template, rt=components, **{"fill": NO_FILLS, **shown})
 
 
-def _tree(tree: StatusTree, look: RobotQuery) -> Mapping[str, Any]:
+def _tree(fleet: Services, tree: StatusTree, look: RobotQuery) -> Mapping[str, Any]:
+    of_components: dict[str, dict[str, None]] = {}
+    for cause, actions in remedies(fleet, tree.robot).items():
+        of_components.setdefault(cause.partition("#")[0], {}).update(dict.fromkeys(actions))
     return {
-        "tree": tree,
+        "tree": tree, "remedies": of_components,
         "branches": components.branches(tree, look.q, look.show, look.chosen),
         "names": components.names(tree.components),
     }  # fmt: skip

@@ -4,7 +4,7 @@ import { showError, toast } from "./api.js";
 import { keepCardCurrent } from "./diagnosis_card.js";
 import { find, findAll, setText } from "./dom.js";
 import { subscribe } from "./feed.js";
-import { fetchFragment, replaceElement } from "./fragments.js";
+import { copyInputs, fetchFragment, replaceElement } from "./fragments.js";
 import { t } from "./strings.js";
 import { fieldToStamp, msToStamp, updateTimes } from "./time.js";
 
@@ -44,7 +44,7 @@ function carryInputs(old, fresh, sent) {
   for (const form of findAll("form[id]", old)) {
     const freshForm = find(`#${form.id}`, fresh);
     if (!freshForm || form === sent) continue;
-    const isUsed = copyValues(form, freshForm);
+    const isUsed = copyInputs(form, freshForm);
     if (isUsed && !("seen" in form.dataset)) freshForm.dataset.body = form.dataset.body;
     for (const error of findAll(":scope > [data-failed]", form)) freshForm.append(error);
   }
@@ -75,19 +75,6 @@ function focusSelector(element) {
   if (form) return `#${form.id} ${field}${element.type === "radio" ? ":checked" : ""}`;
   const details = element.closest("details[id]");
   return details ? `#${details.id} > summary` : "summary, button";
-}
-
-/** Copy the values of fields; true if one differs from its default. */
-function copyValues(from, to) {
-  let isUsed = false;
-  for (const [k, field] of [...from.elements].entries()) {
-    const counterpart = to.elements[k];
-    if (!counterpart || counterpart.name !== field.name || field.tagName === "BUTTON") continue;
-    isUsed ||= field.value !== field.defaultValue && "defaultValue" in field && field.type !== "radio";
-    if (field.type === "radio") counterpart.checked = field.checked;
-    else if (field.tagName !== "FIELDSET") counterpart.value = field.value;
-  }
-  return isUsed;
 }
 
 const page = find("#alarm");

@@ -17,7 +17,7 @@ export class ApiError extends Error {
 /**
  * Send a request and return the JSON of the answer, null for none. Throws ApiError.
  * @param {string} path
- * @param {{method?: string, body?: unknown, signal?: AbortSignal}} [options]
+ * @param {{method?: string, body?: unknown, signal?: AbortSignal, keepalive?: boolean}} [options] `keepalive`: also when the page is closed
  */
 export async function requestJson(path, options = {}) {
   const response = await request(path, options);
@@ -64,11 +64,11 @@ export function clearError(place) {
   place?.querySelector(":scope > [data-failed]")?.remove();
 }
 
-async function request(path, { method = "GET", body, signal } = {}) {
+async function request(path, { method = "GET", body, signal, keepalive } = {}) {
   const headers = { Accept: "application/json" };
   if (method !== "GET") headers["X-CSRF-Token"] = document.querySelector('meta[name="csrf"]').content;
   if (body !== undefined) headers["Content-Type"] = "application/json";
-  const response = await send(path, { method, headers, signal, body: body === undefined ? undefined : JSON.stringify(body) });
+  const response = await send(path, { method, headers, signal, keepalive, body: body === undefined ? undefined : JSON.stringify(body) });
   if (response.status === 401 && location.pathname !== "/sign-in") signIn();
   if (!response.ok) throw await errorOf(response);
   return response;

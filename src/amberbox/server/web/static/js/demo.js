@@ -1,11 +1,12 @@
-// The bar of the demonstration: break a robot, repair it, and describe what to watch for.
+// The bar of the demonstration: break a robot, repair it, describe what to watch for, and confirm
+// motions as somebody at the robot.
 
 import { requestJson, robotApi, showError } from "./api.js";
 import { el, find, setText } from "./dom.js";
 import { subscribe } from "./feed.js";
 
 /**
- * @typedef {{robots: {robot: string, fault: string}[], faults: string[]}} View the faults that can be set, and those that are
+ * @typedef {{robots: {robot: string, fault: string, code: string}[], faults: string[]}} View the faults that can be set, those that are, and codes at robots that wait
  */
 
 const form = find("#demo");
@@ -23,8 +24,10 @@ function start(form) {
   const onState = (view) => {
     for (const { robot, fault } of view.robots) faults.set(robot, fault);
     offerRobots(form.robot, view.robots.map(({ robot }) => robot));
+    showWaiting(view);
     update();
   };
+  const refresh = () => requestJson("/api/v1/demo").then(onState, (error) => showError(error, form));
   const change = (method, body) => changeFault(form, method, body).then(onState, (error) => showError(error, form));
   form.robot.addEventListener("change", update);
   find("[data-fold]", form).addEventListener("click", (event) => toggleBar(form, event.currentTarget));
@@ -33,10 +36,27 @@ function start(form) {
     change("POST", { fault: form.fault.value });
   });
   find("[data-repair]", form).addEventListener("click", () => change("DELETE"));
-  requestJson("/api/v1/demo").then(onState, (error) => showError(error, form));
-  subscribe({ kinds: ["diagnosis"] }).on("diagnosis", (_, robot) => {
+  find("[data-confirm-motion]")?.addEventListener("click", ({ currentTarget }) => {
+    requestJson(`/api/v1/demo/${encodeURIComponent(currentTarget.dataset.robot)}/confirm`, { method: "POST" }).then(onState, refresh);
+  });
+  refresh();
+  const { on } = subscribe({ kinds: ["diagnosis", "command"] });
+  on("command", refresh);
+  on("diagnosis", (_, robot) => {
     if (robot === form.robot.value) showDiagnosisLink(form);
   });
+}
+
+/** Show the first motion that waits for its confirmation, and its code. @param {View} view */
+function showWaiting(view) {
+  const waiting = view.robots.find(({ code }) => code);
+  const line = find("#demo-waits");
+  line.hidden = !waiting;
+  if (!waiting) return;
+  setText(find("[data-robot]", line), waiting.robot);
+  setText(find("[data-code]", line), waiting.code);
+  const button = find("[data-confirm-motion]", line);
+  if (button) button.dataset.robot = waiting.robot;
 }
 
 /** Open or close the bar, which is folded on narrow screens. */

@@ -80,6 +80,61 @@ export function replaceElement(old, fresh) {
   return fresh;
 }
 
+/**
+ * Replace parts of an element: those inside `data-parts`, by their ids, that have changed. What was
+ * entered in a form stays if the fresh part has a form of the same id, except `sent`. So do
+ * boxes with `data-keep`, and how far something is scrolled.
+ * @param {Element} old @param {Element} fresh @param {string} [sent] the id of a form
+ */
+export function placeParts(old, fresh, sent = "") {
+  for (const [name, value] of Object.entries(fresh.dataset)) old.dataset[name] = value;
+  const ids = new Set([...fresh.children].map((part) => part.id));
+  for (const part of [...old.children]) if (!ids.has(part.id)) part.remove();
+  let before = old.firstElementChild;
+  for (const part of [...fresh.children]) {
+    const was = [...old.children].find((other) => other.id === part.id);
+    if (!was) old.insertBefore(document.adoptNode(part), before);
+    else before = placePart(was, part, sent).nextElementSibling;
+  }
+  enhance(old);
+  return old;
+}
+
+function placePart(old, fresh, sent) {
+  if ("parts" in fresh.dataset && "parts" in old.dataset) return placeParts(old, fresh, sent);
+  for (const form of findAll("form[id]", old)) {
+    const freshForm = find(`form[id="${CSS.escape(form.id)}"]`, fresh);
+    if (freshForm && form.id !== sent) copyInputs(form, freshForm);
+  }
+  for (const box of findAll("input[data-keep]", old)) {
+    const freshBox = find(`#${CSS.escape(box.id)}`, fresh);
+    if (freshBox) freshBox.checked = box.checked;
+  }
+  const places = findAll(".scroll", old).map(({ scrollLeft, scrollTop }) => ({ left: scrollLeft, top: scrollTop, behavior: "instant" }));
+  const { activeElement } = document;
+  const caret = old.contains(activeElement) && "selectionStart" in activeElement ? [activeElement.selectionStart, activeElement.selectionEnd] : null;
+  const placed = replaceElement(old, fresh);
+  // the feed was faster than the answer: what was entered, and is sent now, is not in the markup
+  if (placed === old) findAll("form[id]", old).find((form) => form.id === sent)?.reset();
+  findAll(".scroll", placed).forEach((scroll, n) => places[n] && scroll.scrollTo(places[n]));
+  if (caret && caret[0] !== null) document.activeElement.setSelectionRange?.(...caret);
+  return placed;
+}
+
+/** Copy the values of fields to those of a fresh form; true if one differs from its default. */
+export function copyInputs(from, to) {
+  let isUsed = false;
+  for (const [k, field] of [...from.elements].entries()) {
+    const counterpart = to.elements[k];
+    if (!counterpart || counterpart.name !== field.name || field.tagName === "BUTTON" || field.type === "hidden") continue;
+    const isBox = field.type === "radio" || field.type === "checkbox";
+    isUsed ||= field.value !== field.defaultValue && "defaultValue" in field && !isBox;
+    if (isBox) counterpart.checked = field.checked;
+    else if (field.tagName !== "FIELDSET") counterpart.value = field.value;
+  }
+  return isUsed;
+}
+
 /** Replace what is inside an element; the focus stays where it was. */
 export function replaceContent(place, nodes) {
   const focused = focusFinder(place);
@@ -115,8 +170,9 @@ export function latestFragment(target, address, placed) {
  * @param {() => string} address
  * @param {number} [intervalMs]
  * @param {(fresh: Element) => void} [placed]
+ * @param {(old: Element, fresh: Element) => Element} [place]
  */
-export function throttledFragment(target, address, intervalMs = 1000, placed = () => {}) {
+export function throttledFragment(target, address, intervalMs = 1000, placed = () => {}, place = replaceElement) {
   let timer = null;
   let isRequested = false;
 
@@ -124,9 +180,10 @@ export function throttledFragment(target, address, intervalMs = 1000, placed = (
     isRequested = false;
     timer = setTimeout(afterPause, intervalMs);
     if (!target()) return;
-    const fresh = await fetchFragment(address()).catch(() => null); // the feed tells when the server is back
+    const path = address();
+    const fresh = await fetchFragment(path).catch(() => null); // the feed tells when the server is back
     const old = target();
-    if (fresh && old) placed(replaceElement(old, fresh));
+    if (fresh && old && path === address()) placed(place(old, fresh)); // else another view was chosen meanwhile
   }
 
   function afterPause() {

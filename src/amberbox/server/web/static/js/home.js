@@ -61,12 +61,13 @@ form.addEventListener("click", (event) => {
 onNavigation(() => changeView({}));
 
 // changes of values alone come with the list
-const feed = subscribe({ kinds: ["presence", "levels", "alarm", "diagnosis"] });
-for (const kind of ["presence", "levels", "alarm", "diagnosis"]) {
+const feed = subscribe({ kinds: ["presence", "levels", "alarm", "diagnosis", "run", "command"] });
+for (const kind of ["presence", "levels", "alarm", "diagnosis", "run"]) {
   feed.on(kind, (_, robot) => {
     const isReloaded = refreshList(); // the order and the counts may have changed
     if (robot && !isReloaded) refreshCard(robot);
   });
 }
+feed.on("command", throttledFragment(() => find("#unsigned-count"), () => "/pieces/commands/count"));
 feed.on("snapshot", () => refreshList());
 setInterval(refreshList, VALUES_MS);

@@ -25,13 +25,13 @@ function differs(card) {
   return String(card.status.rank) !== rank || Object.entries(shown).some(([name, value]) => card[name] !== value);
 }
 
-const feed = subscribe({ robots: [robot], kinds: ["presence", "levels", "alarm", "diagnosis", "ages"] });
+const feed = subscribe({ robots: [robot], kinds: ["presence", "levels", "alarm", "diagnosis", "run", "ages"] });
 feed.on("snapshot", ({ robots }) => {
   const card = robots.find((other) => other.robot === robot);
   if (card && differs(card)) refresh();
 });
 const refreshSettled = debounce(refresh, SETTLED_MS);
-for (const kind of ["presence", "levels", "alarm", "diagnosis"]) {
+for (const kind of ["presence", "levels", "alarm", "diagnosis", "run"]) {
   feed.on(kind, () => {
     refresh();
     refreshSettled();

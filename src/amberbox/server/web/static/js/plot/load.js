@@ -77,6 +77,7 @@ async function loadTrace(trace, view, points, signal) {
 }
 
 async function requestSeries(trace, from, to, points, signal) {
+  if (trace.request) return trace.request(from, to, points, signal);
   const path = `${robotApi(trace.robot)}/query`;
   const query = new URLSearchParams({
     item: trace.item, variables: trace.variable, points,
@@ -146,7 +147,7 @@ function missionMark(one) {
 }
 
 function noteMark(id, note) {
-  return { id: `note-${id}`, kind: "note", from: stampToSeconds(note.at), to: null,
+  return { id: `note-${id}`, kind: "note", from: stampToSeconds(note.at), to: note.to ? stampToSeconds(note.to) : null,
     text: `${note.text} (${note.who})`, href: "", level: "" };
 }
 
@@ -184,7 +185,7 @@ export function contextLoader(stack) {
       return;
     }
     const signal = nextSignal();
-    const traces = [...stack.traces.values()];
+    const traces = [...stack.traces.values()].filter((trace) => trace.isArchived);
     await Promise.all([...contextRequests(traces, signal), ...loadStatistics(traces, stack.view, signal)]);
     if (signal.aborted) return;
     state.isBusy = false;
@@ -220,7 +221,7 @@ export function contextLoader(stack) {
 
 /** Load statistics of the window, with one request for variables of one item. */
 function loadStatistics(traces, view, signal) {
-  const groups = Map.groupBy(traces.filter((trace) => trace.kind !== "text"),
+  const groups = Map.groupBy(traces.filter((trace) => trace.kind !== "text" && !trace.request),
     (trace) => `${trace.robot}\n${trace.item}\n${trace.origin}`);
   return [...groups.values()].map((group) => loadGroupStatistics(group, view, signal));
 }

@@ -194,7 +194,10 @@ function watchSize(stack, signal) {
  * @property {"number"|"enum"|"bool"|"text"} [kind] see `kindOf`
  * @property {string} [panel] variables of one panel lie over each other; else each has its own
  * @property {number} [origin] seconds that are the zero of its time axis (0)
+ * @property {boolean} [isArchived] false for one of which there are live values only
  * @property {number} [length] seconds after `origin` that are shown, of a mission; else all
+ * @property {function(number, number, number, AbortSignal): Promise<any>} [request] loads the series
+ *   of what is computed: from, to (s), points; `item` is then what it is computed from
  */
 
 const SOFT_MS = 120;
@@ -353,7 +356,7 @@ function windowFunctions(stack) {
   function want() {
     const traces = [...stack.traces.values()];
     for (const trace of traces) {
-      if (trace.asked && isSameWindow(trace.asked, stack.view)) continue;
+      if (!trace.isArchived || (trace.asked && isSameWindow(trace.asked, stack.view))) continue;
       trace.asked = stack.view;
       stack.loader.load(trace, stack.view);
     }

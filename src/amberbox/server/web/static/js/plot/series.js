@@ -224,11 +224,11 @@ export function kindOf(column) {
  * @returns {import("./panel.js").Trace}
  */
 export function traceOf(options, used) {
-  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0, length = null } = options;
+  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0, length = null, isArchived = true, request = null } = options;
   const kind = options.kind ?? kindOf({ type: "", labels });
   const { codes, names } = namesOf(kind, labels);
   return {
-    id, robot, item, variable, label, unit, kind, origin, length, codes, names, panel: options.panel ?? id,
+    id, robot, item, variable, label, unit, kind, origin, length, isArchived, request, codes, names, panel: options.panel ?? id,
     colour: freeColour(used), series: null, live: null, widest: null, statistics: null, problem: null, asked: null,
   };
 }
