@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from amberbox.blackbox.retention.pins import mark as mark
     from amberbox.blackbox.store.tail import follow as follow
     from amberbox.client.opening import open as open
+    from amberbox.core.event_log import log as log
 
 sys.meta_path.append(Moved())
 
@@ -28,4 +29,8 @@ def __getattr__(name: str) -> Any:
         from amberbox.blackbox.retention.pins import mark as mark_incident
 
         return mark_incident
+    if name == "log":
+        from amberbox.core.event_log import log as log_event
+
+        return log_event
     raise AttributeError(f"module 'amberbox' has no attribute {name!r}")

@@ -1,5 +1,7 @@
 """The fleet of the demonstration: simulated robots, their accounts, faults and lost connections.
 
+Each robot takes commands that the technician has signed, whose key lies beside the robots.
+
 A relay between robot and server can be cut; the offered faults are those of the simulator that show
 quickly. All processes end with the demonstration, however it ends.
 """
@@ -7,7 +9,9 @@ quickly. All processes end with the demonstration, however it ends.
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
+import hashlib
 import json
 import os
 import secrets
@@ -17,21 +21,27 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from amberbox import sim
 from amberbox.agent import launcher
 from amberbox.agent.join import with_server, write_key, write_robot_file
+from amberbox.client.signing_key import SigningKey
+from amberbox.core import ed25519
 from amberbox.core.clock import SystemClock
-from amberbox.core.errors import UsageError
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import write_private
+from amberbox.demo.people import PlayedTechnician, confirm_motion, waiting_motion
+from amberbox.demo.recorder import copy_knowledge
 from amberbox.link.join_line import JoinLine, join_line
 from amberbox.server.accounts.passwords import Passwords
 from amberbox.server.accounts.permissions import Role
 from amberbox.server.accounts.robots import add_group, add_robot
 from amberbox.server.accounts.signin import SignInCodes
-from amberbox.server.accounts.users import add_user
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import add_user, find_user
+from amberbox.server.commands import server_id
 from amberbox.server.database import FILE, ServerDatabase
 from amberbox.server.start import make_folder
 
@@ -55,7 +65,6 @@ IDS = ("ropod_001", "ropod_002", "ropod_003")
 SEEDS: Mapping[str, int] = {"ropod_001": 7, "ropod_002": 11, "ropod_003": 5}
 GROUPS: Mapping[str, str] = {"ropod_001": "ward", "ropod_002": "ward", "ropod_003": "kitchen"}
 SOMETIMES_AWAY = "ropod_003"  # its connection to the server is cut repeatedly
-KNOWLEDGE = Path(sim.__file__).parent / "folder"
 _END_S = 30.0
 _ROBOT = """\
 id: {id}
@@ -84,36 +93,80 @@ _BLACK_BOX = """\
     seed: {seed}
     scenario: shuttle
     orders: {orders}
+    commands: {commands}
+"""
+# where the simulated robot takes requests, as its actions have it
+_ADDRESS = "tcp://127.0.0.1:5557"
+_TRUST = """\
+# Who may command this robot from the server
+server: {server}
+confirm: code
+people:
+  {person}: {{key: "{key}", risk: moves}}
 """
 
 
 @dataclass(frozen=True, slots=True)
 class RobotPaths:
-    """Paths of a robot: its folder, the file of orders for its simulator, its log."""
+    """Paths of a robot: its folder, the file of orders for its simulator, its log.
+
+    ``trust`` is its trust file, ``key`` the key of the person named there, in the form of
+    ``amberbox sign``.
+    """
 
     id: str
     folder: Path
     orders: Path
     log: Path
+    trust: Path
+    key: Path
+
+    @property
+    def store(self) -> Path:
+        """Return its store, where the socket of its command process is."""
+        return self.folder / "store"
+
+    @property
+    def commands(self) -> str:
+        """Return the address of its simulator, one that no other robot has."""
+        name = hashlib.sha256(str(self.folder.absolute()).encode()).hexdigest()[:16]
+        return f"ipc://@amberbox-{name}"
 
 
 def robot_paths(robot: str, folder: Path) -> RobotPaths:
     """Return the paths of a robot below the folder of the demonstration."""
-    return RobotPaths(robot, folder / robot, folder / f"{robot}.orders", folder / f"{robot}.log")
+    return RobotPaths(
+        robot, folder / robot, folder / f"{robot}.orders", folder / f"{robot}.log",
+        folder / f"{robot}.trust.yaml", folder / "keys" / f"{Role.TECHNICIAN}.key",
+    )  # fmt: skip
 
 
 def write_folder(place: RobotPaths, line: JoinLine) -> None:
-    """Write a robot's folder: sources, monitors, failure modes and its server."""
+    """Write a robot's folder: sources, monitors, failure modes, actions, experiments and tests, and
+    its server."""
     place.folder.mkdir(parents=True)
-    for path in (path for kind in ("*.yaml", "*.pl") for path in KNOWLEDGE.rglob(kind)):
-        target = place.folder / path.relative_to(KNOWLEDGE)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(path.read_bytes())
-    orders = json.dumps(str(place.orders))  # quoted, as YAML accepts JSON
-    box = _BLACK_BOX.format(id=place.id, seed=SEEDS[place.id], orders=orders)
+    robot = _ROBOT.format(id=place.id)
+    if place.trust.exists():
+        robot += f"commands: {json.dumps(str(place.trust.absolute()))}\n\n"
+    copy_knowledge(place.folder, _ADDRESS, place.commands)
+    orders, commands = json.dumps(str(place.orders)), json.dumps(place.commands)  # as YAML quotes
+    box = _BLACK_BOX.format(id=place.id, seed=SEEDS[place.id], orders=orders, commands=commands)
     (place.folder / "black_box.yaml").write_text(box)
     write_key(place.folder, line.key)
-    write_robot_file(place.folder, with_server(_ROBOT.format(id=place.id), {"url": line.url}))
+    write_robot_file(place.folder, with_server(robot, {"url": line.url}))
+
+
+def write_trust(places: Sequence[RobotPaths], server: str) -> SigningKey:
+    """Make the technician's key, and have robots trust it for a server; return it."""
+    private = ed25519.new_private_key()
+    key = SigningKey(str(Role.TECHNICIAN), ed25519.public_key_of(private), private)
+    for place in places:
+        place.key.parent.mkdir(mode=0o700, exist_ok=True)
+        stored = {"public": key.text, "private": base64.b64encode(private).decode()}
+        write_private(place.key, json.dumps(stored) + "\n")
+        trust = _TRUST.format(server=server, person=Role.TECHNICIAN, key=key.text)
+        write_private(place.trust, trust)
+    return key
 
 
 class SimulatedRobot:
@@ -156,6 +209,7 @@ class OfferedFault:
 
 # by the fault's name in the simulator's catalogue
 OFFERED_FAULTS: Mapping[str, OfferedFault] = {
+    "wheel_front_left_motor_weak": OfferedFault("wheel_front_left", "wheel_front_left#motor_weak"),
     "wheel_rear_right_power_stage_trips": OfferedFault(
         "wheel_rear_right", "wheel_rear_right#power_stage_trips"
     ),
@@ -240,8 +294,19 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
         writer.close()
 
 
-def enrol(data: Path, urls: Mapping[str, str]) -> Mapping[str, JoinLine]:
-    """Create a data folder with people and robots; return the join line of each robot.
+@dataclass(frozen=True, slots=True)
+class EnrolledFleet:
+    """What robots and people need of a new server: join lines by robot, the server's id, and an
+    API token of the technician.
+    """
+
+    lines: Mapping[str, JoinLine]
+    server: str
+    token: str = field(repr=False)
+
+
+def enrol(data: Path, urls: Mapping[str, str]) -> EnrolledFleet:
+    """Create a data folder with people and robots.
 
     ``urls`` are the server's URLs for the robots. The people have random passwords, since they sign
     in by links.
@@ -259,13 +324,19 @@ def enrol(data: Path, urls: Mapping[str, str]) -> Mapping[str, JoinLine]:
             for group in sorted(set(GROUPS.values())):
                 add_group(connection, now_ns, group)
             keys = {robot: add_robot(connection, now_ns, robot, [GROUPS[robot]]) for robot in IDS}
-            return {robot: join_line(urls[robot], robot, key.text) for robot, key in keys.items()}
+            lines = {robot: join_line(urls[robot], robot, key.text) for robot, key in keys.items()}
+            owner = find_user(connection, str(Role.TECHNICIAN))
+            assert owner is not None, "it was added"
+            token = add_token(connection, now_ns, owner, "signs in the demonstration", _SCOPES)
+            return EnrolledFleet(lines, server_id(connection, now_ns), token.text)
     finally:
         database.close()
 
 
 DATA = "server"  # the server's data folder, below that of the demonstration
 _LOOK_S = 0.2
+# of the token that belongs to the technician's computer
+_SCOPES = ("read:status", "read:commands", "write:commands", "read:experiments")
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,6 +358,8 @@ class LiveDemo:
         self._running: dict[str, SimulatedRobot] = {}
         self._broken: dict[str, str] = {}
         self._lock = threading.Lock()
+        self._token = ""
+        self._key: SigningKey | None = None
 
     @property
     def data(self) -> Path:
@@ -306,9 +379,12 @@ class LiveDemo:
     def prepare(self) -> None:
         """Create the server's data folder and the robots' folders."""
         ports = dict.fromkeys(IDS, self._port) | {SOMETIMES_AWAY: self.relay.port}
-        lines = enrol(self.data, {robot: f"http://127.0.0.1:{p}" for robot, p in ports.items()})
-        for robot, line in lines.items():
-            write_folder(robot_paths(robot, self._folder), line)
+        urls = {robot: f"http://127.0.0.1:{p}" for robot, p in ports.items()}
+        enrolled = enrol(self.data, urls)
+        self._token = enrolled.token
+        self._key = write_trust([self.paths(robot) for robot in IDS], enrolled.server)
+        for robot, line in enrolled.lines.items():
+            write_folder(self.paths(robot), line)
 
     def begin(self) -> None:
         """Start the robots; they retry until the server answers.
@@ -316,12 +392,23 @@ class LiveDemo:
         Call it on the main thread: its children live as long as it does.
         """
         for robot in IDS:
-            self._running[robot] = SimulatedRobot(robot_paths(robot, self._folder))
+            self._running[robot] = SimulatedRobot(self.paths(robot))
+
+    def sign(self, url: str) -> None:
+        """Begin to sign what the robots are to do; the server answers at its URL."""
+        assert self._key is not None, "the folders are prepared first"
+        for robot in IDS:
+            store = self.paths(robot).store
+            PlayedTechnician(url, self._token, robot, store, self._key)
 
     def broken(self) -> Mapping[str, str]:
         """Return the present fault of each faulty robot."""
         with self._lock:
             return dict(self._broken)
+
+    def paths(self, robot: str) -> RobotPaths:
+        """Return the paths of a robot, such as those of its trust file and the key to it."""
+        return robot_paths(robot, self._folder)
 
     def damage(self, robot: str, fault: str) -> None:
         """Inject a fault into a robot, replacing an earlier one."""
@@ -338,6 +425,21 @@ class LiveDemo:
         """Remove the fault of a robot."""
         with self._lock:
             self._heal(robot)
+
+    def codes_at_robots(self) -> Mapping[str, str]:
+        """Return the code that is shown at each robot where a motion waits for confirmation."""
+        shown = {}
+        for robot in self._running:
+            with contextlib.suppress(AmberboxError):  # it begins or ends
+                motion = waiting_motion(self.paths(robot).store)
+                if motion is not None:
+                    shown[robot] = motion.code
+        return shown
+
+    def confirm(self, robot: str) -> None:
+        """Confirm the motion that waits at a robot."""
+        self._robot(robot)
+        confirm_motion(self.paths(robot).store)
 
     async def cycle_outages(
         self, plan: OutagePlan, emit: Callable[[str], None], begins: Callable[[], object]

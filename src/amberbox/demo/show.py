@@ -74,7 +74,9 @@ class DemoRun:
 
     def begin(self, start: StartedServer) -> None:
         """Start the task, once the server answers."""
-        self._task = asyncio.get_running_loop().create_task(self._go_on(start.settings.public_url))
+        url = start.settings.public_url
+        self.stage.sign(url)
+        self._task = asyncio.get_running_loop().create_task(self._go_on(url))
         self._task.add_done_callback(_end_if_broken)
 
     def raise_if_broken(self) -> None:
@@ -112,6 +114,8 @@ class DemoRun:
         for role in reversed(Role):
             print(f"  {role:<11} {url}/in#{self.stage.codes.make(str(role))}")
         print("\nBreak a robot with the bar at the top of each page, and watch what follows."
+              "\nWhat robots are to do has to be signed with a person's key: here it is for you."
+              "\nA motion has to be confirmed at the robot, too: use the bar."
               "\nEnter prints new links, Ctrl-C ends everything.\n", flush=True)  # fmt: skip
 
     async def _show_status(self, url: str) -> None:

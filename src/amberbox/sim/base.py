@@ -263,12 +263,15 @@ class WheelUnit:
         self._cycles = (self._cycles + 50) % 65536
         late = self._noise.integer(0, 200)
         stamps = [time_us - 1000 - late, time_us - 2000 - late, time_us - 1500 - late]
+        return [self.status(), self._cycles, *stamps], self.numbers(pressure_hpa)
+
+    def numbers(self, pressure_hpa: float) -> list[float]:
+        """Return the (noiseless) numbers of the sensor frame now; nothing in the unit changes."""
         pressure = pressure_hpa + self._barometer + self.pressure_offset_hpa
         inertial = [*self._shake, 9.81, 0.0, 0.0, self._yaw_rate, _IMU_DEGC]
         pivot = [self.measured_pivot_rad, self.pivot_rate]
         drives = self.drive_1.readings() + self.drive_2.readings()
-        numbers = [*drives, *pivot, self.voltage_v, *inertial, pressure]
-        return [self.status(), self._cycles, *stamps], numbers
+        return [*drives, *pivot, self.voltage_v, *inertial, pressure]
 
     def _drive(self, dt: float, ahead: float, turn: float, rolling: float) -> tuple[float, float]:
         """Let both drives turn; return the forces that the floor takes from them."""

@@ -8,7 +8,7 @@ why. All decisions use what the robot measures, never the true state.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,6 +104,7 @@ class CommandedParts:
     laser_rear: Laser
     world: HospitalWorld
     marker: DockingMarker
+    restart: Callable[[str], None]
 
 
 class CommandExecutor:
@@ -148,6 +149,9 @@ class CommandExecutor:
             return self._status(request.text("id"))
         if request.do == "stop":
             return self._stop()
+        if request.do == "restart":
+            self._parts.restart(request.text("process"))
+            return _answer("restart")
         if self._running is not None:
             first = self._running
             reason = f"{first.request.do} ({first.id}) runs"

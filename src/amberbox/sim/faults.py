@@ -263,6 +263,12 @@ class Injector:
         for course in courses:
             course.until_s = min(course.until_s, now_s)
 
+    def heal_part(self, part: str, now_s: float) -> None:
+        """End every fault that affects a part."""
+        for course in self._courses:
+            if any(effect.part == part for effect in course.fault.effects):
+                course.until_s = min(course.until_s, now_s)
+
     def apply(self, now_s: float) -> None:
         """Set all knobs to their present values."""
         changed = [course for course in self._courses if course.update(now_s)]

@@ -71,7 +71,7 @@ class Fieldbus:
                 self._units.items(), readings, rows, strict=True
             )
         }
-        commands = {name: _command(unit) for name, unit in self._units.items()}
+        commands = {name: command_fields(unit) for name, unit in self._units.items()}
         return {"commands": commands, "sensors": sensors}
 
     def counters(self) -> dict[str, Any]:
@@ -120,7 +120,8 @@ class Fieldbus:
         return value if value == value and abs(value) < 1e38 else 1e38
 
 
-def _command(unit: WheelUnit) -> dict[str, float]:
+def command_fields(unit: WheelUnit) -> dict[str, float]:
+    """Return what the computer tells a unit."""
     return {
         "command1": 3,
         "command2": 0,

@@ -1,4 +1,4 @@
-"""A simulated robot that publishes over ZeroMQ in real time, and takes faults from a keyboard."""
+"""A simulated robot that publishes in real time on its buses, and takes faults from a keyboard."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Literal, Protocol
@@ -17,7 +17,9 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.sim.buses import RobotBus
 from amberbox.sim.command_socket import CommandSocket
+from amberbox.sim.disturbances import Disturber
 from amberbox.sim.robot import TICK_NS, Message, Robot
 
 
@@ -67,13 +69,18 @@ def wait_for_subscriber(socket: Any, stop: threading.Event) -> None:
 
 def publish(
     robot: Robot,
-    publisher: PublishingSocket,
+    publisher: PublishingSocket | None,
     plan: LiveRun,
     orders: queue.SimpleQueue[str],
     stop: threading.Event,
     commands: CommandSocket | None = None,
+    buses: Sequence[RobotBus] = (),
+    disturber: Disturber | None = None,
 ) -> int:
     """Publish until the plan's end or ``stop``; return how many messages were sent.
+
+    ``publisher`` is a ZeroMQ socket; ``buses`` are further ones, which get the same messages: those
+    of the robot, or what ``disturber`` makes of them.
 
     The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
     sent, so that it contains every message sent. Requests of ``commands`` are answered between
@@ -85,12 +92,15 @@ def publish(
         contextlib.nullcontext() if plan.truth is None else plan.truth.open("w", encoding="utf-8")
     )
     with file as truth:
-        for batch in _batches(robot, plan, orders, stop, commands):
+        for batch in _batches(robot, plan, orders, stop, commands, buses, disturber):
             if truth is not None:
                 truth.write("".join(truth_line(topic, message) for topic, _, message in batch))
                 truth.flush()
             for topic, _, message in batch:
-                publisher.send_multipart([topic.encode(), encode(message)])
+                if publisher is not None:
+                    publisher.send_multipart([topic.encode(), encode(message)])
+                for bus in buses:
+                    bus.send(topic, message)
             sent += len(batch)
     return sent
 
@@ -130,6 +140,8 @@ def _batches(
     orders: queue.SimpleQueue[str],
     stop: threading.Event,
     commands: CommandSocket | None,
+    buses: Sequence[RobotBus],
+    disturber: Disturber | None,
 ) -> Iterator[list[Message]]:
     """Yield the messages of each tick when they are due."""
     began_ns, began_s = time.monotonic_ns(), robot.now_s
@@ -138,9 +150,15 @@ def _batches(
             print(apply_order(robot, orders.get()), file=sys.stderr, flush=True)
         if commands is not None:
             commands.serve(robot)
-        batch = list(robot.step_until(robot.now_s + TICK_NS / NS))
+        messages = robot.step_until(robot.now_s + TICK_NS / NS)
+        if disturber is not None:
+            messages = disturber.feed(messages, robot.now_ns + TICK_NS)
+        batch = list(messages)
+        due_ns = time.monotonic_ns()
         if plan.speed != "max":
-            due_ns = began_ns + (robot.now_s - began_s) * NS / plan.speed
+            due_ns = began_ns + round((robot.now_s - began_s) * NS / plan.speed)
             stop.wait(max(0.0, (due_ns - time.monotonic_ns()) / NS))
+        for bus in buses:
+            bus.tick(robot, due_ns)
         if batch:
             yield batch

@@ -15,6 +15,7 @@ import msgspec
 
 from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.sim.navigation import MAX_SPEED, MAX_YAW_RATE
+from amberbox.sim.topics import NODES
 from amberbox.sim.world import CART_PLACES, PLACES
 
 MAX_REQUEST_BYTES = 4096
@@ -76,6 +77,7 @@ REQUESTS: Mapping[str, Mapping[str, Parameter]] = {
     "unload": {"area": NameParameter(CART_PLACES)},
     "stop": {},
     "resume": {},
+    "restart": {"process": NameParameter(NODES, is_required=True)},
     "status": {"id": NameParameter()},
 }
 MOTIONS = ("linear", "rotate", "go_to", "dock", "undock", "load", "unload")

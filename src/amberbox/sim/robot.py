@@ -124,6 +124,7 @@ class Robot:
                 laser_rear=self.laser_rear,
                 world=self.world,
                 marker=self.docking,
+                restart=self.restart,
             )
         )
 
@@ -143,6 +144,16 @@ class Robot:
     def now_s(self) -> float:
         """Return seconds since the robot was switched on."""
         return self._ticks / TICKS_PER_S
+
+    @property
+    def device_time_us(self) -> int:
+        """Return the time of the clock that the devices of the fieldbus share, microseconds."""
+        return (self._ticks * TICK_NS + 77_000_000_000) // 1000
+
+    @property
+    def pressure_hpa(self) -> float:
+        """Return the air pressure where the robot is."""
+        return 1013.2 - _HPA_PER_FLOOR * self.executor.floor_height
 
     @property
     def parts(self) -> dict[str, object]:
@@ -176,6 +187,11 @@ class Robot:
     def heal(self, fault_id: str) -> None:
         """End a fault now; UsageError if it was never injected."""
         self._injector.heal(fault_id, self.now_s)
+
+    def restart(self, process: str) -> None:
+        """Restart a process: what has killed it, or holds it up, is over."""
+        self._injector.heal_part(f"node_{process}", self.now_s)
+        self.host.nodes[process].die()
 
     def command(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Take a request such as ``{"do": "linear", "distance_m": 1.0}``; return the answer now.
@@ -350,9 +366,7 @@ class Robot:
         return self.now_ns, dict(twist_fields(*self._command))
 
     def _read_wheels(self) -> Reading:
-        time_us = (self._ticks * TICK_NS + 77_000_000_000) // 1000
-        pressure = 1013.2 - _HPA_PER_FLOOR * self.executor.floor_height
-        return self.now_ns, self.bus.wheels(time_us, pressure)
+        return self.now_ns, self.bus.wheels(self.device_time_us, self.pressure_hpa)
 
     def _read_bus(self) -> Reading:
         return self.now_ns, self.bus.counters()

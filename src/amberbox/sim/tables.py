@@ -1,9 +1,10 @@
-"""Print the tables of docs/start/simulator.md from the topics and the catalogue of faults."""
+"""Print the tables of docs/start/simulator.md: topics, faults and kinds of disturbances."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from amberbox.sim.disturbances import CONVERSIONS, kinds_as_rows
 from amberbox.sim.faults import SimulatedFault, catalogue
 from amberbox.sim.topics import NODES, TOPICS, WHEELS, TopicSpec, leaves
 
@@ -19,6 +20,18 @@ def fault_table() -> str:
     """Return the fault catalogue as a Markdown table."""
     head = ["| fault | component | domain | magnitude | onset | what it is | shows in |"]
     return "\n".join([*head, "|" + "---|" * 7, *map(_fault_row, catalogue().values())])
+
+
+def disturbance_table() -> str:
+    """Return the kinds of disturbances as a Markdown table, and the conversions of units."""
+    head = "| kind | disturbs | amount | what happens |\n|---|---|---|---|"
+    disturbs = {"both": "messages, or a variable", "item": "messages", "variable": "a variable"}
+    rows = [
+        f"| `{kind}` | {disturbs[reach]} | {amount} | {description} |"
+        for kind, reach, amount, description in kinds_as_rows()
+    ]
+    names = ", ".join(f"`{name}`" for name in CONVERSIONS)
+    return "\n".join([head, *rows, "", f"Conversions of `unit`: {names}."])
 
 
 def _topic(spec: TopicSpec) -> Iterator[str]:
@@ -48,4 +61,4 @@ def _fault_row(fault: SimulatedFault) -> str:
 
 
 if __name__ == "__main__":
-    print(topic_tables(), fault_table(), sep="\n")
+    print(topic_tables(), fault_table(), disturbance_table(), sep="\n")

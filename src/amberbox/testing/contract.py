@@ -12,6 +12,11 @@ In the tests of a plugin::
         with observe(gps.Source(config, "gps")) as sink:
             start_the_device()
             assert sink.wait_for("/fix", 100)
+
+    def test_gps_reads_its_device_in_a_process() -> None:
+        with observe_in_process(gps, "- gps: {device: /dev/gps0}") as sink:
+            start_the_device()
+            assert sink.wait_for("/fix", 100)
 """
 
 from __future__ import annotations
@@ -23,16 +28,24 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
+from amberbox.blackbox.recorder.source_process import (
+    SourceProcess,
+    SourceProcessError,
+    needs_process,
+)
 from amberbox.core.config import build
 from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.options import describe
-from amberbox.core.source import Power, Source, TopicOptions
+from amberbox.core.robot_graph import RobotGraph
+from amberbox.core.source import MOST_LATE_S, Power, Source, TopicOptions
+from amberbox.core.topic_selection import TopicPattern, is_pattern
 from amberbox.core.types import Topic
-from amberbox.core.yaml_nodes import parse_yaml
-from amberbox.testing.clock import PATIENCE_S
+from amberbox.core.yaml_nodes import Node, parse_yaml
+from amberbox.testing.clock import PATIENCE_S, wait_until
 
 
 @dataclass
@@ -50,6 +63,10 @@ class MemorySink:
     longest_bytes: int = 64_000_000
     losses: list[tuple[str, str, int, int, int, str]] = field(default_factory=list)
     """(topic, peer, from and to in ns, how many, reason)"""
+    drops: list[tuple[str, int, int, int]] = field(default_factory=list)
+    """(topic, from and to in ns, how many)"""
+    complete_ns: int | None = None
+    """Up to when all messages have been passed on, as a source with ``late_s`` said last."""
 
     def __post_init__(self) -> None:
         self._lock = threading.Condition(threading.RLock())
@@ -73,8 +90,21 @@ class MemorySink:
     def longest_message(self) -> int:
         return self.longest_bytes
 
+    def complete(self, until_ns: int) -> None:
+        self.complete_ns = until_ns
+
+    def dropped(self, stream: int, from_ns: int, to_ns: int, count: int) -> None:
+        """Note messages for which the process of a source had no room."""
+        with self._lock:
+            self.drops.append((self.topics[stream].name, from_ns, to_ns, count))
+            self._lock.notify_all()
+
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         self._note_link("up", topic, peer, "", since_ns or self.now_ns())
+
+    def link_up_at(self, topic: str, peer: str, at_ns: int, since_ns: int | None) -> None:
+        """Note a link that the process of a source reported at ``at_ns``."""
+        self.link_up(topic, peer, since_ns or at_ns)
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
         self._note_link("down", topic, peer, reason, since_ns or self.now_ns())
@@ -135,7 +165,8 @@ _KIND = re.compile(r"[a-z][a-z0-9_]*")
 def assert_source_contract(module: ModuleType, name: str, *, run_s: float = 0.3) -> None:
     """Check a source module: its definitions, its sample, and a run without its device.
 
-    Raises AssertionError with all problems found.
+    It runs here and in a process of its own; with a native library only there. Raises
+    AssertionError with all problems found.
     """
     problems = module_problems(module, name)
     assert not problems, "\n".join(problems)
@@ -143,7 +174,13 @@ def assert_source_contract(module: ModuleType, name: str, *, run_s: float = 0.3)
     source = module.Source(config, name)
     problems = source_problems(source)
     assert not problems, "\n".join(problems)
-    with observe(source) as sink:
+    if not needs_process(module, config):
+        with observe(source) as sink:
+            sink.ended.wait(run_s)
+        problems = _read_graph_problems(module, name, config)
+        assert not problems, "\n".join(problems)
+    with observe_in_process(module, module.SAMPLE) as sink:
+        wait_until(lambda: sink.complete_ns or sink.ended.is_set(), "the process of the source")
         sink.ended.wait(run_s)
 
 
@@ -169,22 +206,72 @@ def _is_frozen_dataclass(cls: Any) -> bool:
 
 def _sample_problems(module: ModuleType, name: str) -> list[str]:
     try:
-        sample_config(module, name)
+        config = sample_config(module, name)
     except AssertionError as error:
         return [str(error)]
+    beside: Any = getattr(module, "beside_recorder", lambda same: same)
+    if not isinstance(beside(config), module.Config):
+        return [f"{name}: beside_recorder() must return a Config"]
     return []
 
 
 def sample_config(module: ModuleType, name: str) -> Any:
     """Build the configuration that a module's ``SAMPLE`` shows."""
-    problems: list[Problem] = []
-    root = parse_yaml(module.SAMPLE, f"{name}.SAMPLE", problems)
-    blocks = (root.items if root is not None else None) or ()
-    entries: Mapping[str, Any] = (blocks[0].mapping if len(blocks) == 1 else None) or {}
+    entries = _block(module.SAMPLE)
     assert list(entries) == [name], f"{name}: SAMPLE must be a list of one block '- {name}:'"
-    config = build(module.Config, entries[name], problems, name)
+    return _configuration(module, name, entries[name])
+
+
+def _block(text: str) -> Mapping[str, Node]:
+    """Return the name of the one block in a list of YAML, and its node; empty if it is none."""
+    root = parse_yaml(text, "black_box.yaml", [])
+    blocks = (root.items if root is not None else None) or ()
+    return (blocks[0].mapping if len(blocks) == 1 else None) or {}
+
+
+def _configuration(module: ModuleType, name: str, node: Node) -> Any:
+    problems: list[Problem] = []
+    config = build(module.Config, node, problems, name)
     assert config is not None, "\n".join(str(problem) for problem in problems)
     return config
+
+
+def _read_graph_problems(module: ModuleType, name: str, config: Any) -> list[str]:
+    """Return the problems of a module's ``read_graph`` where nothing runs."""
+    if not hasattr(module, "read_graph"):
+        return []
+    began_s = time.monotonic()
+    try:
+        graph = module.read_graph(config, 0.1)
+    except AmberboxError:  # nobody answers
+        return []
+    if time.monotonic() - began_s > STOP_S:
+        return [f"{name}: read_graph() took {time.monotonic() - began_s:.0f} s instead of 0.1 s"]
+    return graph_problems(graph)
+
+
+def graph_problems(graph: Any) -> list[str]:
+    """Return where a graph is not as ``core.robot_graph`` states."""
+    if not isinstance(graph, RobotGraph):
+        return [f"read_graph() returned {type(graph).__name__} instead of a RobotGraph"]
+    problems = []
+    lists = {
+        "nodes": graph.nodes,
+        "topics": [topic.name for topic in graph.topics],
+        "services": [service.name for service in graph.services],
+    }
+    for topic in graph.topics:
+        lists[f"publishers of {topic.name}"] = topic.publishers
+        lists[f"subscribers of {topic.name}"] = topic.subscribers
+    for what, names in lists.items():
+        if not all(isinstance(name, str) and name for name in names):
+            problems.append(f"graph: {what} must be names that are not empty")
+        elif list(names) != sorted(names):
+            problems.append(f"graph: {what} are not sorted")
+    known = {name for topic in graph.topics for name in (*topic.publishers, *topic.subscribers)}
+    known |= {service.node for service in graph.services if service.node}
+    missing = sorted(known - {*graph.nodes})
+    return problems + [f"graph: {name} is not among the nodes" for name in missing]
 
 
 def source_problems(source: Source) -> list[str]:
@@ -197,6 +284,8 @@ def source_problems(source: Source) -> list[str]:
         problems.append("topics() must give TopicOptions")
     if list(topics) != list(source.topics()):
         problems.append("topics() must give the same each time")
+    if not 0 <= getattr(source, "late_s", 0.0) <= MOST_LATE_S:
+        problems.append(f"'late_s' must be between 0 and {MOST_LATE_S:g} s")
     return problems
 
 
@@ -205,6 +294,10 @@ class ObservedSink(MemorySink):
     """A sink in memory that also notes where a source breaks its contract."""
 
     declared: frozenset[str] = frozenset()
+    late_s: float = 0.0
+    """How late its messages may come, as the source states."""
+    in_process: bool = False
+    """Whether it runs in a process of its own, which calls ``complete`` by itself."""
     problems: list[str] = field(default_factory=list)
     ended: threading.Event = field(default_factory=threading.Event)
     """Set when ``run`` has returned or raised."""
@@ -233,11 +326,13 @@ class ObservedSink(MemorySink):
             self._note(f"{name}: a time of receipt lies before the one before it")
         if received_ns > time.time_ns() + 1_000_000:
             self._note(f"{name}: a time of receipt lies in the future")
+        if not self.in_process and received_ns < (self.complete_ns or 0):
+            self._note(f"{name}: a time of receipt lies before a call of complete()")
         self._last_ns[stream] = received_ns
         super().message(stream, data, received_ns)
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
-        if self.declared and not any(topic.startswith(name) for name in self.declared):
+        if self.declared and not any(_asks_for(name, topic) for name in self.declared):
             self._note(f"{topic}: was not asked for")
         self._up.add((topic, peer))
         super().link_up(topic, peer, since_ns)
@@ -249,6 +344,24 @@ class ObservedSink(MemorySink):
             self._note(f"{topic}: link_down without a reason")
         self._up.discard((topic, peer))
         super().link_down(topic, peer, reason, since_ns)
+
+    def complete(self, until_ns: int) -> None:
+        if not self.in_process and not self.late_s:
+            self._note("complete() was called by a source without 'late_s'")
+        if until_ns > time.time_ns() + 1_000_000:
+            self._note("complete() was given a time in the future")
+        super().complete(until_ns)
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        if not any(known.name == topic for known in self.topics):
+            self._note(f"{topic}: lost() of a topic that topic() was never given")
+        if count < 1 or not reason:
+            self._note(f"{topic}: lost() needs a count above 0 and a reason")
+        if not 0 < from_ns <= to_ns <= time.time_ns() + 1_000_000:
+            self._note(f"{topic}: lost() needs times of receipt, the earlier one first")
+        super().lost(topic, peer, from_ns, to_ns, count, reason)
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         if not _KIND.fullmatch(kind):
@@ -266,23 +379,67 @@ class ObservedSink(MemorySink):
             self.problems.append(problem)
 
 
+def _asks_for(name: str, topic: str) -> bool:
+    """Return whether a configured name asks for a topic: as a pattern, or as its beginning."""
+    return TopicPattern(name).fits(topic) if is_pattern(name) else topic.startswith(name)
+
+
 @contextmanager
 def observe(source: Source) -> Iterator[ObservedSink]:
     """Run a source in a thread; at the end stop it and check that it kept the contract.
 
     ``run`` may raise AmberboxError when its device is missing; any other exception fails.
     """
-    sink = ObservedSink(declared=frozenset(topic.name for topic in source.topics()))
+    sink = _sink_for(source)
+    with _observed(source, sink):
+        yield sink
+    if sink.late_s and sink.error is None:
+        assert sink.complete_ns is not None, "'late_s' is set, but complete() was never called"
+
+
+@contextmanager
+def observe_in_process(
+    module: ModuleType, block: str, folder: Path = Path()
+) -> Iterator[ObservedSink]:
+    """Run a source in a process of its own, as the recorder does; check it as ``observe`` does.
+
+    ``block`` is its block as in ``black_box.yaml``; ``folder`` is where that file would be.
+    """
+    ((name, node),) = _block(block).items()
+    sink = _sink_for(module.Source(_configuration(module, name, node), name))
+    sink.in_process = True
+    process = SourceProcess(module.__name__, name, name, node, folder, stop_s=STOP_S)
+    with _observed(process, sink):
+        yield sink
+
+
+def _sink_for(source: Source) -> ObservedSink:
+    declared = frozenset(topic.name for topic in source.topics())
+    return ObservedSink(declared=declared, late_s=getattr(source, "late_s", 0.0))
+
+
+class _Runs(Protocol):
+    def run(self, sink: ObservedSink, stop: threading.Event) -> None: ...
+
+
+@contextmanager
+def _observed(source: _Runs, sink: ObservedSink) -> Iterator[None]:
     stop = threading.Event()
     thread = threading.Thread(target=_run, args=(source, sink, stop), daemon=True)
     thread.start()
     try:
-        yield sink
+        yield
+    except Exception as failure:
+        if sink.error is not None:
+            failure.add_note(f"the source has ended before: {sink.error!r}")
+        raise
     finally:
         has_ended = sink.ended.is_set()
         stop.set()
-        thread.join(STOP_S)
+        thread.join(STOP_S + 2.0 * sink.in_process)
     assert not thread.is_alive(), f"run() did not return within {STOP_S} s after stop was set"
+    if isinstance(sink.error, SourceProcessError):
+        raise AssertionError("the process of the source must not die") from sink.error
     if sink.error is not None and not isinstance(sink.error, AmberboxError):
         raise AssertionError("run() must raise nothing but AmberboxError") from sink.error
     left_up = sink.open_links() if has_ended and sink.error is None else ()
@@ -292,7 +449,7 @@ def observe(source: Source) -> Iterator[ObservedSink]:
     assert not problems, "\n".join(problems)
 
 
-def _run(source: Source, sink: ObservedSink, stop: threading.Event) -> None:
+def _run(source: _Runs, sink: ObservedSink, stop: threading.Event) -> None:
     try:
         source.run(sink, stop)
     except BaseException as error:  # the thread's error is judged by the code that started it

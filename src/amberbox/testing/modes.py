@@ -40,6 +40,7 @@ from amberbox.core.types import IntArray
 from amberbox.core.yaml_nodes import parse_yaml
 
 if TYPE_CHECKING:
+    from hypothesis import settings
     from hypothesis.strategies import DrawFn, SearchStrategy
 
 
@@ -356,6 +357,19 @@ def _series(draw: DrawFn, times: IntArray, kind: str) -> SampleSeries:
     return SampleSeries(times, np.ma.MaskedArray(values, null))
 
 
+def kit_settings(examples: int) -> settings:
+    """Return how kits run: so many examples, as slow as may be, and none is kept."""
+    from hypothesis import HealthCheck, settings
+
+    return settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
 def at_s(*seconds: float) -> Any:
     """Return an instant, or an array of several, in the time of ``one_input``."""
     instants = [T0_NS + round(second * NS) for second in seconds]
@@ -443,15 +457,9 @@ def _check_function(
     examples: int,
     returned: set[str],
 ) -> None:
-    from hypothesis import HealthCheck, given, settings
+    from hypothesis import given
 
-    @settings(
-        max_examples=examples,
-        deadline=None,
-        database=None,
-        report_multiple_bugs=False,
-        suppress_health_check=list(HealthCheck),
-    )
+    @kit_settings(examples)
     @given(sampled_worlds(module, file, *kinds))
     def check(world: SampledWorld) -> None:
         with np.errstate(all="ignore"):
