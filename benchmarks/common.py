@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import socket
 import statistics
 import threading
@@ -10,6 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from amberbox.core.errors import UsageError
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +33,22 @@ class Row:
     peer: str = ""
     ratio: float | None = None
     note: str = ""
+
+
+def kept_lines(path: Path, made: Callable[..., T]) -> Iterator[T]:
+    """Yield what an earlier run has kept as lines of JSON; torn lines are left out.
+
+    Raises UsageError for lines of another version.
+    """
+    lines = path.read_text().splitlines() if path.exists() else []
+    for number, line in enumerate(lines, start=1):
+        try:
+            yield made(**json.loads(line))
+        except json.JSONDecodeError:
+            continue
+        except TypeError as error:
+            what = f"{path}:{number}: is not of this version: {error}"
+            raise UsageError(what, "keep it in another file") from error
 
 
 @contextmanager

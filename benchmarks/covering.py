@@ -38,6 +38,7 @@ CASES = (300, 120, 60)
 TARGETS_MS = {200: {"ranking, median": 1, "ranking, largest": 50, "next test, largest": 10}}
 READABLE, LEAK, DETECTS = 0.6, 1e-3, 0.99
 TESTS = 10
+BINS = 8
 STRANGE = 40
 
 
@@ -122,6 +123,7 @@ def _at(size: tuple[int, int, int], cases: int) -> Iterator[Row]:
     rng = random.Random(1)
     outcomes = [_outcome(model, random_case(model, rng, 1 + n % 3)) for n in range(cases)]
     yield from _times(name, size[0], outcomes)
+    yield from _with_sizes(name, model, outcomes)
     yield from _beside_clingo(name, model, outcomes[:30])
     yield from _accuracy(name, model, outcomes)
     yield _not_in_the_fmea(name, model, rng)
@@ -152,6 +154,68 @@ def _times(name: str, components: int, outcomes: Sequence[Outcome]) -> Iterator[
     yield Row(f"{name}: least share of the probability that was enumerated, median", covered, "%")
     incomplete = sum(bool(o.answer.incomplete) for o in outcomes)
     yield Row(f"{name}: questions that ran into a budget", incomplete, "")
+
+
+def graded(model: Model, rng: random.Random) -> Model:
+    """Let each failure mode show its symptoms with sizes of its own; modes exclude each other."""
+    links = tuple(
+        replace(link, sizes=_spread(rng)) if "#" in link.cause else link for link in model.links
+    )
+    of: dict[str, list[str]] = {}
+    for mode in model.modes:
+        of.setdefault(mode.component, []).append(mode.id)
+    modes = tuple(
+        replace(mode, excludes=frozenset(of[mode.component]) - {mode.id}) for mode in model.modes
+    )
+    signs = tuple(replace(sign, bins=BINS) for sign in model.signs)
+    return replace(model, links=links, modes=modes, signs=signs)
+
+
+def _spread(rng: random.Random) -> tuple[float, ...]:
+    first, weights = rng.randrange(BINS - 1), [0.0] * BINS
+    weights[first] = weights[first + 1] = 0.5
+    return tuple(weights)
+
+
+def sized(model: Model, case: Case, rng: random.Random) -> Evidence:
+    """Give the present symptoms of a case sizes that its faults show."""
+    prediction = predict(model, case.faults)
+
+    def level(place: int) -> int:
+        shares = prediction.sizes(model, place)[1:] if place in model.tables.graded else []
+        return 1 + rng.choices(range(BINS), shares)[0] if any(shares) else rng.randint(1, BINS)
+
+    observations = {
+        name: replace(seen, level=level(model.sign_places[name]))
+        if seen.state == "present"
+        else seen
+        for name, seen in case.evidence.observations.items()
+    }
+    return replace(case.evidence, observations=observations)
+
+
+def _with_sizes(name: str, model: Model, outcomes: Sequence[Outcome]) -> Iterator[Row]:
+    """Ask the same questions with sizes, and with modes of a component that exclude each other."""
+    rng = random.Random(2)
+    other = graded(model, rng)
+    assert other.tables
+    plain, times, right, before = [], [], [], []
+    for outcome in outcomes:
+        evidence = sized(other, outcome.case, rng)
+        spent, answer = _cpu_ms(partial(diagnose, other, evidence))
+        again, _ = _cpu_ms(partial(diagnose, model, outcome.case.evidence))
+        times.append(spent)
+        plain.append(again)
+        if _visible(model, outcome.case):
+            right.append(_in_groups(answer, outcome.case.faults, 1))
+            before.append(_in_groups(outcome.answer, outcome.case.faults, 1))
+    ratio = sum(times) / sum(plain)
+    yield Row(f"{name}: ranking with sizes, median", percentile(times, 50), "ms")
+    yield Row(f"{name}: ranking with sizes, largest", max(times), "ms")
+    yield Row(f"{name}: the same questions with sizes cost", ratio, "x", note="to be <= 2")
+    note = f"without sizes {100 * statistics.fmean(before):.0f} %"
+    share = 100 * statistics.fmean(right)
+    yield Row(f"{name}: with sizes, exact set in the first group", share, "%", note=note)
 
 
 def _accuracy(name: str, model: Model, outcomes: Sequence[Outcome]) -> Iterator[Row]:

@@ -1,7 +1,8 @@
 """How often a diagnosis names what is broken, on simulated missions with random faults.
 
-``python -m benchmarks.diagnosis --missions 300 --hours 20`` makes the full experiment: two thirds
-of the missions have one fault, one third has two. `make bench` makes a smaller one.
+``python -m benchmarks.diagnosis --single 200 --double 100 --unknown 60 --hours 20 --keep FILE``
+makes the full experiment; the same command goes on with FILE after an interruption. `make bench`
+makes a smaller one. What counts as right is written in ``docs/reference/accuracy.md``.
 """
 
 from __future__ import annotations
@@ -11,16 +12,13 @@ import contextlib
 import functools
 import io
 import json
-import math
 import os
 import random
-import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -28,7 +26,8 @@ from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main as amberbox
 from amberbox.consult.folder_knowledge import load_knowledge
 from amberbox.core.clock import NS
-from amberbox.core.types import Diagnosis
+from amberbox.core.errors import UsageError
+from amberbox.core.types import Batch, Diagnosis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.tracker import FaultTracker
@@ -38,11 +37,15 @@ from amberbox.monitoring.plan import MonitoringPlan
 from amberbox.monitoring.plan_loader import load_plan
 from amberbox.monitoring.record_evaluation import DiagnosedEngine
 from amberbox.sim.faults import load_faults
-from amberbox.sim.robot import START_NS
-from benchmarks.common import Row
+from amberbox.sim.random_disturbances import Variable, simulated_variables
+from amberbox.sim.robot import START_NS, Message, Robot
+from benchmarks import detectors
+from benchmarks.accuracy import UNKNOWN_KINDS, Outcome, measured, rows, with_figures
+from benchmarks.common import Row, kept_lines
 from benchmarks.missions import (
     Batches,
     Mission,
+    disturbed,
     draw,
     live,
     mode_of,
@@ -53,44 +56,13 @@ from benchmarks.missions import (
 
 FIRST_SEED = 400_000
 """Seeds from here on; the FMEA was written with lower ones."""
-SINGLES, DOUBLES, NOMINAL_H = 24, 12, 0.5
+SINGLES, DOUBLES, DRAWN, KNOBS, NOMINAL_H = 24, 12, 10, 10, 0.5
 """What `make bench` runs."""
+SURVEY_SEED, SURVEY_S = 300_000, 60.0
+"""The drive that tells which values variables have, for the amounts of drawn disturbances."""
 UNKNOWN_FAULTS = Path(__file__).with_name("unknown_faults.yaml")
 CHUNK_H = 0.25
-BANDS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
-Z = 1.96
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a mission was diagnosed.
-
-    ``group`` is the first ambiguity group of the answer that stands at its end, ``probability``
-    that of its leading hypothesis. Times are in seconds from the first confirmed symptom.
-    """
-
-    kind: str
-    seed: int
-    faults: list[tuple[str, float, float]]
-    truth: list[str]
-    group: list[list[str]]
-    probability: float = 0.0
-    split: bool = True
-    named_s: float | None = None
-    ended_s: float = 0.0
-    early: int = 0
-    diagnoses: int = 0
-    cpu_s: float = 0.0
-
-    @property
-    def shows(self) -> bool:
-        """Tell whether any symptom was confirmed."""
-        return bool(self.group)
-
-    @property
-    def is_right(self) -> bool:
-        """Tell whether the first group has the true set of faults."""
-        return self.truth in self.group
+SHOWN = 4
 
 
 # -- one mission
@@ -105,12 +77,19 @@ class World:
     wanted: dict[str, set[str]]
 
 
-@functools.cache
 def world() -> World:
-    """Make a robot folder and read it."""
-    with tempfile.TemporaryDirectory() as place, contextlib.redirect_stdout(io.StringIO()):
-        path = Path(place) / "robot"
-        amberbox(["new", str(path), "--from", "sim"])
+    """Return the robot folder of this experiment."""
+    return world_with(detectors.model_path())
+
+
+@functools.cache
+def world_with(model: Path | None) -> World:
+    """Make a robot folder, which names a model of detectors or none, and read it."""
+    with tempfile.TemporaryDirectory() as place:
+        path = robot_folder(Path(place) / "robot")
+        if model is not None:
+            with (path / "robot.yaml").open("a") as file:
+                file.write(f"detection: {{model: {json.dumps(str(model.resolve()))}}}\n")
         folder = load_folder(path)
         plan, _ = load_plan(folder)
         knowledge, _ = load_knowledge(folder, plan)
@@ -125,57 +104,117 @@ def world() -> World:
     return World(plan, knowledge, wanted)
 
 
-def findings(mission: Mission) -> Iterator[Finding]:
-    """Yield what the watcher of a robot finds in a mission."""
-    at = world()
-    watcher = DiagnosedEngine(Engine(at.plan), FaultTracker(at.knowledge))
-    watcher.begin(START_NS)
-    batches = Batches(at.wanted)
+def robot_folder(path: Path) -> Path:
+    """Make the folder of a simulated robot."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        amberbox(["new", str(path), "--from", "sim"])
+    return path
+
+
+class Watching:
+    """The watcher of a robot folder on one mission."""
+
+    def __init__(self, at: World) -> None:
+        self._engine = DiagnosedEngine(Engine(at.plan), FaultTracker(at.knowledge))
+        self._engine.begin(START_NS)
+        self._batches = Batches(at.wanted)
+
+    def take(
+        self, messages: Sequence[Message], until_ns: int, told: Iterable[Batch] = ()
+    ) -> Iterator[Finding]:
+        """Take messages and what detectors told up to a time; yield what is found."""
+        for batch in (*self._batches.of(messages), *told):
+            self._engine.feed(batch)
+        yield from self._engine.advance(until_ns)
+
+
+def findings(mission: Mission, *following: detectors.Following) -> Iterator[Finding]:
+    """Yield what the watcher of a robot finds in a mission, told by the detectors that follow."""
+    watching = Watching(world())
     for until_s, messages in live(mission):
-        for batch in batches.of(messages):
-            watcher.feed(batch)
-        yield from watcher.advance(START_NS + round(until_s * NS))
+        until_ns = START_NS + round(until_s * NS)
+        told = [batch for one in following for batch in one.take(messages, until_ns)]
+        yield from watching.take(messages, until_ns, told)
 
 
-def diagnoses(mission: Mission) -> Iterator[Diagnosis]:
+def diagnoses(mission: Mission, *following: detectors.Following) -> Iterator[Diagnosis]:
     """Yield the revisions of all diagnoses of a mission."""
-    return (found for found in findings(mission) if isinstance(found, Diagnosis))
+    return (found for found in findings(mission, *following) if isinstance(found, Diagnosis))
 
 
 def judge(kind: str, mission: Mission, truth: Sequence[str]) -> Outcome:
     """Diagnose a mission and compare the answer with what is true."""
     start_s = time.process_time()
-    made = list(diagnoses(mission))
-    standing = [each for each in made if each.state == "open" and each.hypotheses]
-    late = [each for each in standing if seconds_of(each.at_ns) >= mission.onset_s]
-    faults = [(p.fault.id, p.magnitude, p.at_s) for p in mission.faults]
+    following = detectors.follow()
+    made = list(diagnoses(mission, *following))
+    found = replace(outcome_of(kind, mission, truth, made), cpu_s=time.process_time() - start_s)
+    return with_alarms(found, mission, *following)
+
+
+def with_alarms(found: Outcome, mission: Mission, *following: detectors.Following) -> Outcome:
+    """Return an outcome with the alarms of the detectors that have followed the mission."""
+    for one in following:
+        alarmed, alarms = one.found_by(mission.onset_s), one.false_alarms(mission.onset_s)
+        found = replace(found, alarmed=alarmed, alarms=alarms)
+    return found
+
+
+def outcome_of(
+    kind: str, mission: Mission, truth: Sequence[str], made: Sequence[Diagnosis]
+) -> Outcome:
+    """Compare the revisions of all diagnoses of a mission with what is true."""
     found = Outcome(
-        kind, mission.seed, faults, sorted(truth), [],
-        early=len(standing) - len(late),
+        kind,
+        mission.seed,
+        described(mission),
+        sorted(truth),
+        mission.scenario,
+        mission.seconds,
+        misled=0.0,
+        early=sum(seconds_of(each.at_ns) < mission.onset_s for each in made if is_answer(each)),
         diagnoses=len({each.id for each in made}),
-    )  # fmt: skip
-    took_s = time.process_time() - start_s
-    if not late:
-        return Outcome(**{**asdict(found), "cpu_s": took_s})
-    last, first_ns = late[-1], late[0].at_ns
-    right = (each.at_ns for each in late if found.truth in first_group(each))
-    named_ns = next(right, None)
-    return Outcome(
-        **{
-            **asdict(found),
-            "group": first_group(last),
-            "probability": last.hypotheses[0].probability,
-            "split": len(last.groups[0].members) < 2 or bool(last.groups[0].split_by),
-            "named_s": None if named_ns is None else (named_ns - first_ns) / NS,
-            "ended_s": (last.at_ns - first_ns) / NS,
-            "cpu_s": took_s,
-        }
+    )
+    late = [each for each in made if seconds_of(each.at_ns) >= mission.onset_s]
+    answers = [each for each in late if is_answer(each)]
+    if not answers:
+        return found
+    standing = {each.id: each for each in made}  # the last revision of each
+    last = standing[answers[-1].id]
+    stands = is_answer(last)
+    groups = [
+        (seconds_of(each.at_ns) - mission.last_onset_s, first_group(each)) for each in answers
+    ]
+    wrong = [
+        each.hypotheses[0].probability
+        for each, (at_s, group) in zip(answers, groups, strict=True)
+        if at_s >= 0 and group[0] and group[0] != found.truth
+    ]
+    return replace(
+        found,
+        group=first_group(last) if stands else [],
+        probability=last.hypotheses[0].probability if stands else 0.0,
+        ended_group=[] if stands else groups[-1][1],
+        symptom_s=groups[0][0],
+        named_s=next((at_s for at_s, group in groups if found.truth in group), None),
+        led_s=next((at_s for at_s, group in groups if found.truth == group[0]), None),
+        misled=max(wrong, default=0.0),
     )
 
 
+def described(mission: Mission) -> list[str]:
+    """Return what is wrong in a mission, as the simulator's command line writes it."""
+    faults = [f"{p.fault.id}={p.magnitude:.3g}@{p.at_s:.1f}s" for p in mission.faults]
+    return faults + [str(each) for each in mission.disturbances]
+
+
+def is_answer(diagnosis: Diagnosis) -> bool:
+    """Tell whether a revision is an answer that stands, as long as no later one follows."""
+    return diagnosis.state == "open" and bool(diagnosis.hypotheses)
+
+
 def first_group(diagnosis: Diagnosis) -> list[list[str]]:
-    """Return the sets of faults of the leading ambiguity group."""
-    faults = {each.id: sorted(each.faults) for each in diagnosis.hypotheses}
+    """Return the sets of faults of the leading ambiguity group, without what followed from them."""
+    faults = {each.id: sorted(each.faults - each.follows) for each in diagnosis.hypotheses}
     return [faults[name] for name in diagnosis.groups[0].members]
 
 
@@ -184,39 +223,83 @@ def first_group(diagnosis: Diagnosis) -> list[list[str]]:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A mission to be judged: ``number`` of its ``kind``."""
+    """A mission to be judged: ``number`` of its ``kind``, on the seeds from ``first_seed`` on."""
 
     kind: str
     number: int
+    first_seed: int = FIRST_SEED
+
+    @property
+    def seed(self) -> int:
+        """Return the seed of the mission."""
+        return self.first_seed + self.number
 
 
 def work(job: Job) -> Outcome:
     """Make and judge a mission."""
+    mission = mission_of(job)
+    return judge(job.kind, mission, truth_of(job.kind, mission))
+
+
+def truth_of(kind: str, mission: Mission) -> list[str]:
+    """Return the failure modes that are there in a mission."""
+    if kind in UNKNOWN_KINDS:
+        return [UNKNOWN]
+    modes = world().knowledge.fmea.modes
+    return [mode_of(planted.fault, modes) for planted in mission.faults]
+
+
+def mission_of(job: Job) -> Mission:
+    """Draw the mission of a job."""
     if job.kind == "nominal":
-        return judge(job.kind, nominal(FIRST_SEED + job.number, CHUNK_H * 3600.0), [])
-    if job.kind == "unknown":
+        return nominal(job.seed, CHUNK_H * 3600.0)
+    if job.kind == "drawn":
+        return disturbed(job.seed, variables())
+    if job.kind == "knobs":
         faults = list(load_faults(UNKNOWN_FAULTS).values())
         chance = random.Random(f"unknown {job.number}")
-        fault = faults[job.number % len(faults)]
-        return judge(job.kind, with_faults(FIRST_SEED + job.number, [fault], chance), [UNKNOWN])
-    mission = draw(FIRST_SEED + job.number, 1 if job.kind == "single" else 2)
-    modes = world().knowledge.fmea.modes
-    return judge(job.kind, mission, [mode_of(planted.fault, modes) for planted in mission.faults])
+        return with_faults(job.seed, [faults[job.number % len(faults)]], chance)
+    return draw(job.seed, 1 if job.kind == "single" else 2)
 
 
-def jobs(singles: int, doubles: int, unknown: int, hours: float) -> list[Job]:
+def revisions(job: Job) -> Iterator[str]:
+    """Yield the revisions of a mission as text: what was present, and what was said."""
+    mission = mission_of(job)
+    yield ", ".join(described(mission)) or "nothing is wrong"
+    for each in diagnoses(mission, *detectors.follow()):
+        since_s = seconds_of(each.at_ns) - min(mission.last_onset_s, mission.seconds)
+        yield f"{since_s:+.1f} s  {each.id} {each.state}: {', '.join(each.symptoms)}"
+        for hypothesis in each.hypotheses[:SHOWN]:
+            faults = ", ".join(sorted(hypothesis.faults)) or "nothing"
+            yield f"    {100 * hypothesis.probability:5.1f} %  {faults}"
+
+
+@functools.cache
+def variables() -> list[Variable]:
+    """Return the variables that monitors and symptoms of the robot folder read."""
+    wanted = world().wanted
+    said = Robot(SURVEY_SEED).step_until(SURVEY_S)
+    return [
+        each
+        for each in simulated_variables(said)
+        if each.path.replace(".", "_") in wanted.get(f"sim_{each.item}", ())
+    ]
+
+
+def jobs(counts: Mapping[str, int], first_seed: int = FIRST_SEED) -> list[Job]:
     """List the missions of an experiment, mixed so that a part of them is a fair sample."""
-    chunks = round(hours / CHUNK_H)
-    counts = {"single": singles, "double": doubles, "unknown": unknown, "nominal": chunks}
-    made = [Job(kind, number) for kind, count in counts.items() for number in range(count)]
+    made = [Job(kind, n, first_seed) for kind, count in counts.items() for n in range(count)]
     random.Random(0).shuffle(made)
     return made
 
 
-def run(wanted: Sequence[Job], tell: Callable[[Outcome], None] = lambda _: None) -> list[Outcome]:
-    """Judge missions on all cores, politely."""
+def run(
+    wanted: Sequence[Job], tell: Callable[[Outcome], None] = lambda _: None, processes: int = 0
+) -> list[Outcome]:
+    """Judge missions in so many processes, politely; 0 is two, or one on a single core."""
     found = []
-    with get_context("spawn").Pool(min(2, os.cpu_count() or 1), polite) as pool:
+    processes = processes or min(2, os.cpu_count() or 1)
+    with get_context("spawn").Pool(processes, polite) as pool:
         for outcome in pool.imap_unordered(work, wanted):
             tell(outcome)
             found.append(outcome)
@@ -228,91 +311,95 @@ def polite() -> None:
     os.nice(10)
 
 
-# -- figures
+# -- the experiment
 
 
 def measure() -> list[Row]:
     """Run the small experiment."""
-    return rows(run(jobs(SINGLES, DOUBLES, 10, NOMINAL_H)))
+    return rows(run(jobs(counts_of(SINGLES, DOUBLES, DRAWN, KNOBS, NOMINAL_H))))
 
 
-def rows(found: Sequence[Outcome]) -> list[Row]:
-    """Return the figures of an experiment."""
-    of = {kind: [o for o in found if o.kind == kind] for kind in ("single", "double", "unknown")}
-    faulty = [*of["single"], *of["double"]]
-    shown = [outcome for outcome in faulty if outcome.shows]
-    nominal_runs = [outcome for outcome in found if outcome.kind == "nominal"]
-    made = [
-        _share("one fault named", of["single"], "target: 95"),
-        _share("two faults named", of["double"], "both, in one set; target: 80"),
-        _share("not in the FMEA, said so", of["unknown"], "target: 70"),
-        Row("faults without any symptom", len(faulty) - len(shown), f"of {len(faulty)}"),
-    ]
-    sizes = [len(outcome.group) for outcome in shown]
-    if sizes:
-        made.append(Row("mean size of the first group", statistics.fmean(sizes), "sets",
-                        note="target: 2.0"))  # fmt: skip
-        made.append(Row("largest first group", max(sizes), "sets", note="target: 6"))
-        times = [math.inf if o.named_s is None else o.named_s for o in shown]
-        median = statistics.median(times)
-        made.append(Row("median time to name it", median, "s",
-                        note="after the first confirmed symptom; target: 3"))  # fmt: skip
-    if nominal_runs:
-        count = sum(outcome.diagnoses for outcome in nominal_runs)
-        note = f"in {len(nominal_runs) * CHUNK_H:g} nominal hours; target: 1 in 20"
-        made.append(Row("diagnoses of a sound robot", count, "", note=note))
-    return [*made, *_reliability(shown)]
+def counts_of(single: int, double: int, drawn: int, knobs: int, hours: float) -> dict[str, int]:
+    """Return how many missions of each kind an experiment has."""
+    chunks = round(hours / CHUNK_H)
+    return {"single": single, "double": double, "drawn": drawn, "knobs": knobs, "nominal": chunks}
 
 
-def _share(name: str, outcomes: Sequence[Outcome], note: str) -> Row:
-    right, count = sum(o.is_right for o in outcomes), len(outcomes)
-    low, high = interval(right, count)
-    text = f"{right} of {count}; 95 % interval {100 * low:.0f}-{100 * high:.0f} %; {note}"
-    return Row(name, 100.0 * right / max(1, count), "%", note=text)
-
-
-def _reliability(shown: Iterable[Outcome]) -> Iterator[Row]:
-    """Yield how often leading hypotheses are right, by how probable they are said to be."""
-    outcomes = list(shown)
-    for low, high in pairwise(BANDS):
-        inside = [o for o in outcomes if low <= o.probability < high or high == o.probability == 1]
-        if not inside:
-            continue
-        right = sum(o.truth == o.group[0] for o in inside)
-        said = statistics.fmean(o.probability for o in inside)
-        note = f"{right} of {len(inside)}; said {100 * said:.0f} % on average"
-        name = f"right where {100 * low:.0f}-{100 * high:.0f} % is said"
-        yield Row(name, 100.0 * right / len(inside), "%", note=note)
-
-
-def interval(right: int, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson's)."""
-    if not count:
-        return 0.0, 1.0
-    share, extra = right / count, Z * Z / count
-    middle = (share + extra / 2) / (1 + extra)
-    half = Z / (1 + extra) * math.sqrt(share * (1 - share) / count + extra / (4 * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+def kept(path: Path) -> list[Outcome]:
+    """Read the outcomes that an earlier run has kept; torn lines are left out."""
+    return list({(one.kind, one.seed): one for one in kept_lines(path, Outcome)}.values())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run an experiment of a given size and print its figures."""
-    parser = argparse.ArgumentParser(description="Measure how often diagnoses are right.")
-    parser.add_argument("--missions", type=int, default=SINGLES + DOUBLES)
-    parser.add_argument("--unknown", type=int, default=10)
-    parser.add_argument("--hours", type=float, default=NOMINAL_H)
-    parser.add_argument("--keep", type=Path, help="write what each mission gave to this file")
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
+    detectors.use(options.model)
+    if options.show:
+        print(*revisions(replace(options.show, first_seed=options.first_seed)), sep="\n")
+        return 0
     doubles = options.missions // 3
-    wanted = jobs(options.missions - doubles, doubles, options.unknown, options.hours)
-    kept = options.keep.open("a") if options.keep else None
-
-    def tell(outcome: Outcome) -> None:
-        if kept is not None:
-            print(json.dumps(asdict(outcome)), file=kept, flush=True)
-
-    _print(rows(run(wanted, tell)))
+    double = doubles if options.double is None else options.double
+    single = options.missions - doubles if options.single is None else options.single
+    counts = counts_of(single, double, options.unknown, options.knobs, options.hours)
+    try:
+        before = kept(options.keep) if options.keep else []
+    except UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    done = {(outcome.kind, outcome.seed) for outcome in before}
+    wanted = [job for job in jobs(counts, options.first_seed) if (job.kind, job.seed) not in done]
+    found = before + ([] if options.print else _run(wanted, options.keep, options.processes))
+    _print(rows(found))
+    if options.page:
+        path = options.page
+        path.write_text(with_figures(path.read_text(), measured(found, options.state)))
     return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description="Measure how often diagnoses are right.")
+    add = parser.add_argument
+    add("--single", type=int, help="missions with one fault")
+    add("--double", type=int, help="missions with two faults")
+    add("--missions", type=int, default=SINGLES + DOUBLES, help="both, two thirds with one fault")
+    add("--unknown", type=int, default=DRAWN, help="missions with a drawn disturbance")
+    add("--knobs", type=int, default=KNOBS, help="missions with a fault of unknown_faults.yaml")
+    add("--hours", type=float, default=NOMINAL_H, help="hours without any fault")
+    add("--first-seed", type=int, default=FIRST_SEED)
+    add("--processes", type=int, default=0, help="so many at once; 0: two")
+    add("--keep", type=Path, metavar="FILE", help="add what each mission gave; leave out its own")
+    add("--print", action="store_true", help="run nothing, print the figures of --keep")
+    add(
+        "--show",
+        type=_job,
+        metavar="KIND:NUMBER",
+        help="print the revisions of one mission, as drawn:7",
+    )
+    add("--model", metavar="FILE|learn", help="with detectors: a model file, or learn one first")
+    add("--page", type=Path, metavar="FILE", help="renew the figures of docs/reference/accuracy.md")
+    add("--state", default="", help="with --page: the state of the code, as 'version 0.9'")
+    return parser
+
+
+def _job(text: str) -> Job:
+    kind, _, number = text.partition(":")
+    if kind not in counts_of(0, 0, 0, 0, 0.0) or not number.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is no mission; one is drawn:7")
+    return Job(kind, int(number))
+
+
+def _run(wanted: Sequence[Job], keep: Path | None, processes: int) -> list[Outcome]:
+    if keep is None:
+        return run(wanted, processes=processes)
+    is_torn = keep.exists() and not keep.read_bytes().endswith(b"\n") and keep.stat().st_size > 0
+    with keep.open("a") as file:
+        if is_torn:
+            print(file=file)
+
+        def tell(outcome: Outcome) -> None:
+            print(json.dumps(asdict(outcome)), file=file, flush=True)
+
+        return run(wanted, tell, processes)
 
 
 def _print(made: Iterable[Row]) -> None:

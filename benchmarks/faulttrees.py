@@ -1,15 +1,19 @@
 """Fault trees: probability and all minimal cut sets, beside SCRAM where it is installed.
 
 The trees of the Aralia benchmark are measured where they lie beside the project; the others are
-made here: robots whose functions share power, network and computers. Trees that are compiled from
-failure modes are those of all functions of the simulated robot, and of a random one.
+made here: robots whose functions share power, network and computers, and plants that are too large
+to be solved. Trees that are compiled from failure modes are those of all functions of the simulated
+robot, and of a random one.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import random
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,10 +36,20 @@ from amberbox.diagnosis.fmea.loader import load_fmea
 from amberbox.diagnosis.fmea.model import FailureMode, Fmea, FmeaComponent, FmeaFunction
 from benchmarks.common import Row, wall_s
 from benchmarks.covering import random_robot
+from benchmarks.fault_tree_plants import LayerShape, PlantShape, layers, plant
 
 ARALIA = Path(__file__).resolve().parents[2] / "shared" / "data" / "diagnosis" / "fault_trees"
 SIMULATED = Path(sim.__file__).parent / "folder" / "fmea.yaml"
 TARGETS = {"baobab1": "to be <= 1 s"}
+PLANTS = {
+    "20 systems in pairs": PlantShape(20, 2, 2, 2, 10),
+    "30 systems, one supply each": PlantShape(supplies=1),
+    "30 systems, two supplies": PlantShape(),
+    "30 systems with NOT": PlantShape(nots=0.3),
+    "40 systems, three supplies": PlantShape(40, 3, 4, 3, 30),
+    "60 systems, two supplies": PlantShape(60, 3, 3, 2, 30),
+}
+LAYERS = {"8 of 60 gates": LayerShape(), "8 of 60 gates, with NOT and XOR": LayerShape(odd=0.03)}
 
 
 def measure() -> list[Row]:
@@ -43,6 +57,9 @@ def measure() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         files = [*sorted(ARALIA.glob("*.xml")), *_made(Path(folder))]
         rows = [row for path in files for row in _of_file(path)]
+        plants = list(_plants(Path(folder)))
+        for path in (*sorted(ARALIA.glob("*.xml")), *plants):
+            rows += _whole_run(path, Path(folder))
     rows += _of_failure_modes("simulated robot", _simulated())
     rows += _of_failure_modes("200 components, 500 failure modes", random_fmea(200, 500))
     return rows
@@ -117,6 +134,44 @@ def _made(folder: Path) -> Iterator[Path]:
         path = folder / f"robot of {components} components.xml"
         path.write_text(write_mef(robot(components)), encoding="utf-8")
         yield path
+
+
+def _plants(folder: Path) -> Iterator[Path]:
+    for name, shape in PLANTS.items():
+        path = folder / f"plant, {name}.xml"
+        path.write_text(write_mef(plant(shape, 1)), encoding="utf-8")
+        yield path
+    for name, layer in LAYERS.items():
+        path = folder / f"layers, {name}.xml"
+        path.write_text(write_mef(layers(layer, 1)), encoding="utf-8")
+        yield path
+
+
+def _whole_run(path: Path, folder: Path) -> Iterator[Row]:
+    """Measure a run of the command with its default limits: seconds and memory."""
+    out = folder / "answer.json"
+    command = [sys.executable, "-m", "amberbox", "faulttree", str(path), "--json"]
+    peak_mb = 0.0
+
+    def run() -> None:
+        nonlocal peak_mb
+        with out.open("wb") as file:
+            child = subprocess.Popen([*command, "--most-probable", "100"], stdout=file)
+            _, _, usage = os.wait4(child.pid, 0)
+            child.returncode = 0
+        peak_mb = usage.ru_maxrss / 1024
+
+    taken = wall_s(run, 1)
+    found = json.loads(out.read_text(encoding="utf-8"))
+    low, high = found["probability_bounds"]
+    share = found["most_probable"]["share"]
+    size = f"{found['gates']} gates, {found['basic_events']} events"
+    chance = f"P {low:.6g}" if low == high else f"P {low:.4g} to {high:.4g}"
+    best = f"share of the 100 best {share[0]:.1%} to {share[1]:.1%}"
+    yield Row(
+        f"{path.stem}: whole run", taken, "s", note=f"{size}; {chance}; {best}; to be <= 20 s"
+    )
+    yield Row(f"{path.stem}: memory", peak_mb, "MB", note="to be <= 500 MB")
 
 
 def robot(components: int) -> FaultTree:

@@ -14,7 +14,10 @@ import numpy as np
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Ragged
+from amberbox.sim.disturbances import Disturbance, Disturber
 from amberbox.sim.faults import SimulatedFault, catalogue
+from amberbox.sim.random_disturbances import Variable
+from amberbox.sim.random_disturbances import draw as draw_disturbance
 from amberbox.sim.robot import START_NS, Message, Robot
 
 ONSET_S = (25.0, 60.0)
@@ -24,6 +27,8 @@ LATER_S = (0.0, 40.0)
 AFTER_S = 90.0
 """How long a mission goes on after its last fault has begun."""
 CHUNK_S = 30.0
+NOMINAL = ("transport", "shift", "shuttle", "transport", "charging", "standing", "transport")
+"""The drives of nominal hours, in turns."""
 NAMES = {
     "load_loose": "base#load_loose",
     "e_stop_line_loose": "safety#e_stop_line_loose",
@@ -54,11 +59,21 @@ class Mission:
     cart: bool
     faults: tuple[Planted, ...]
     seconds: float
+    disturbances: tuple[Disturbance, ...] = ()
 
     @property
     def onset_s(self) -> float:
-        """When the first fault begins."""
-        return min((planted.at_s for planted in self.faults), default=math.inf)
+        """When the first fault or disturbance begins."""
+        return min(self._onsets_s(), default=math.inf)
+
+    @property
+    def last_onset_s(self) -> float:
+        """When the last fault or disturbance begins."""
+        return max(self._onsets_s(), default=math.inf)
+
+    def _onsets_s(self) -> Iterator[float]:
+        yield from (planted.at_s for planted in self.faults)
+        yield from (disturbance.at_s for disturbance in self.disturbances)
 
 
 def draw(seed: int, count: int) -> Mission:
@@ -84,9 +99,17 @@ def with_faults(seed: int, faults: Sequence[SimulatedFault], chance: random.Rand
     return Mission(seed, scenario, cart, tuple(planted), planted[-1].at_s + AFTER_S)
 
 
+def disturbed(seed: int, variables: Sequence[Variable]) -> Mission:
+    """Draw a mission in which no part is faulty, but one disturbance of some variable begins."""
+    chance = random.Random(f"disturbed {seed}")
+    at_s = chance.uniform(*ONSET_S)
+    drawn = draw_disturbance(f"mission {seed}", variables, at_s)
+    return Mission(seed, "transport", chance.random() < 0.5, (), at_s + AFTER_S, (drawn,))
+
+
 def nominal(seed: int, seconds: float) -> Mission:
-    """Draw a mission without any fault: most of them transport, some charge, some stand."""
-    scenario = ("transport", "transport", "transport", "charging", "standing")[seed % 5]
+    """Draw a mission without any fault, in all scenarios one after the other: most transport."""
+    scenario = NOMINAL[seed % len(NOMINAL)]
     return Mission(seed, scenario, scenario == "transport" and seed % 2 == 0, (), seconds)
 
 
@@ -113,6 +136,7 @@ def live(mission: Mission) -> Iterator[tuple[float, list[Message]]]:
     robot = Robot(mission.seed, scenario=mission.scenario)
     for planted in mission.faults:
         robot.inject(planted.fault, planted.at_s, planted.magnitude, planted.until_s)
+    disturber = Disturber(mission.disturbances, robot.start_ns, mission.seed)
     until_s = 0.0
     while until_s < mission.seconds:
         first = until_s == 0.0
@@ -121,7 +145,7 @@ def live(mission: Mission) -> Iterator[tuple[float, list[Message]]]:
         if first:
             robot.base.has_cart = mission.cart
         messages += robot.step_until(until_s)
-        yield until_s, messages
+        yield until_s, list(disturber.feed(messages, robot.now_ns))
 
 
 class Batches:
@@ -151,9 +175,11 @@ class Batches:
             kind, data[name] = _column([get(message) for _, message in rows])
             columns.append(Column(name, name, kind))
         log_ns = np.array([sent_ns for sent_ns, _ in rows], np.int64)
-        schema = ItemSchema("sim", tuple(columns))
+        stamps = (message["header"]["stamp"] for _, message in rows)
+        stamp_ns = np.array([stamp["sec"] * NS + stamp["nanosec"] for stamp in stamps], np.int64)
+        schema = ItemSchema("sim", tuple(columns), stamp="header/stamp")
         places = np.arange(len(rows))
-        return Batch(f"sim_{topic}", schema, "main", 1, places, log_ns, log_ns, log_ns, data)
+        return Batch(f"sim_{topic}", schema, "main", 1, places, log_ns, log_ns, stamp_ns, data)
 
 
 def seconds_of(time_ns: int) -> float:

@@ -7,11 +7,15 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from foxglove import messages as fox
 
 from amberbox.blackbox.columns import Unroller
+from amberbox.blackbox.columns.frame_layout import FrameField, FrameLayout, FrameUnroller
 from amberbox.blackbox.columns.json_messages import widen_schema
+from amberbox.blackbox.columns.protobuf_messages import ProtobufUnroller
 from amberbox.blackbox.columns.ros_messages import RosUnroller
 from amberbox.blackbox.columns.unroll import unroller
+from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from benchmarks.common import Row, rate
 from benchmarks.mix import START_NS, make_message, store
@@ -29,10 +33,16 @@ TYPES = (
 )
 
 
+PROTOBUF_WAYS = {
+    "PoseInFrame": (("by layout", BATCH), ("by layout", 10 * BATCH), ("one by one", BATCH)),
+    "LaserScan": (("one by one", BATCH), ("one by one", 10 * BATCH)),
+}
+
+
 def measure() -> list[Row]:
     """Measure rows per CPU second, by layout and with the decoder for many layouts."""
     ros = [row for name in TYPES for cdr in (False, True) for row in _of_type(name, cdr)]
-    return [*ros, *_of_json()]
+    return [*ros, *_of_protobuf(), *_of_frames(), *_of_json()]
 
 
 def _of_type(name: str, cdr: bool) -> Iterator[Row]:
@@ -55,8 +65,10 @@ def _of_type(name: str, cdr: bool) -> Iterator[Row]:
         yield Row(what, value, "rows/s", f"rosbags + flatten {peer:,.0f}", value / peer, note)
 
 
-def _in_batches(unroll: Unroller, messages: Sequence[bytes]) -> Callable[[], None]:
-    batches = [messages[start : start + BATCH] for start in range(0, len(messages), BATCH)]
+def _in_batches(
+    unroll: Unroller, messages: Sequence[bytes], size: int = BATCH
+) -> Callable[[], None]:
+    batches = [messages[start : start + size] for start in range(0, len(messages), size)]
 
     def all_batches() -> None:
         for batch in batches:
@@ -86,6 +98,40 @@ def _flatten(value: Any, name: str, flat: dict[str, Any]) -> None:
             _flatten(item, f"{name}_{index}", flat)
     else:
         flat[name] = value
+
+
+def _of_protobuf() -> Iterator[Row]:
+    rng = np.random.default_rng(1)
+    identity = fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    made: dict[str, list[fox.PoseInFrame | fox.LaserScan]] = {name: [] for name in PROTOBUF_WAYS}
+    for k in range(BATCH * BATCHES):
+        stamp = fox.Timestamp(START_NS // NS + k, int(rng.integers(NS)))
+        pose = fox.Pose(position=fox.Vector3(x=k * 0.1, y=1.0, z=0.0), orientation=identity)
+        made["PoseInFrame"].append(fox.PoseInFrame(timestamp=stamp, frame_id="map", pose=pose))
+        ranges = rng.random(720).tolist()
+        made["LaserScan"].append(fox.LaserScan(timestamp=stamp, frame_id="laser", ranges=ranges))
+    for name, messages in made.items():
+        known = messages[0].get_schema()
+        schema = Schema(known.name, known.encoding, known.data)
+        data = [message.encode() for message in messages]
+        for way, size in PROTOBUF_WAYS[name]:
+            unroll = ProtobufUnroller(schema, by_layout=way == "by layout")
+            what = f"{name}, protobuf, {len(unroll.schema.columns)} columns, {way}"
+            value = rate(len(data), _in_batches(unroll, data, size))
+            yield Row(what, value, "rows/s", note=f"batches of {size:,}")
+
+
+def _of_frames() -> Iterator[Row]:
+    rng = np.random.default_rng(1)
+    fields = tuple(
+        FrameField(f"axis/{n}/{name}", 64 * n + bit, bits, "int", scale=scale)
+        for n in range(4)
+        for name, bit, bits, scale in (("position", 0, 32, 1e-4), ("speed", 32, 20, 0.01))
+    )
+    frames = [rng.bytes(32) for _ in range(BATCH * BATCHES)]
+    unroll = FrameUnroller(FrameLayout(fields, 32).to_schema("drives"))
+    value = rate(len(frames), _in_batches(unroll, frames))
+    yield Row(f"raw frames by layout, {len(fields)} columns", value, "rows/s")
 
 
 def _of_json() -> Iterator[Row]:

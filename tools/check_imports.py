@@ -20,17 +20,18 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "core": frozenset(),
     "blackbox": frozenset({"core"}),
     "sim": frozenset({"core"}),
+    "simbuses": frozenset({"core", "sim", "blackbox"}),
     "testing": frozenset({"core", "blackbox"}),
     "diagnosis": frozenset({"core"}),
     "monitoring": frozenset({"core", "blackbox"}),
     "detection": frozenset({"core", "blackbox"}),
-    "consult": frozenset({"core", "blackbox", "monitoring", "diagnosis"}),
+    "consult": frozenset({"core", "blackbox", "monitoring", "diagnosis", "experiments"}),
     "experiments": frozenset({"core", "blackbox"}),
     "link": frozenset({"core", "blackbox"}),
     "client": frozenset({"core", "blackbox"}),
     "agent": _UPPER,
     "server": _UPPER,
-    "demo": _UPPER | {"sim", "agent", "server"},
+    "demo": _UPPER | {"sim", "agent", "server", "client"},
     "cli": _UPPER | {"sim", "testing", "agent", "server", "client", "demo"},
     "": frozenset({"core", "blackbox", "client"}),
     "__main__": frozenset({"cli", "core"}),
@@ -38,14 +39,29 @@ ALLOWED: Mapping[str, frozenset[str]] = {
 """Which of our packages each may import, besides itself; "" is the package's front door."""
 
 SOURCES = f"{OURS}.blackbox.sources"
-PROTOCOLS = (f"{OURS}.blackbox.sources.ros1", f"{OURS}.blackbox.formats", f"{OURS}.sim")
+PROTOCOLS = tuple(
+    f"{OURS}.{name}"
+    for name in (
+        "blackbox.sources.ros1",
+        "blackbox.sources.ros2_transports",
+        "blackbox.formats",
+        "blackbox.canbus",
+        "blackbox.ethercat",
+        "blackbox.payloads",
+        "blackbox.sources.zre",
+        "sim",
+    )
+)
 """Protocol libraries of our own: what a source may import besides ``core``."""
 
 MODES = f"{OURS}.monitoring.modes"
 PROBES = f"{OURS}.monitoring.probes"
 ROS1 = f"{OURS}.blackbox.sources.ros1"
+ROS2 = f"{OURS}.blackbox.sources.ros2_transports"
 EVIDENCE = f"{OURS}.diagnosis.evidence"
 ACTIONS = f"{OURS}.experiments.actions"
+DETECTORS = f"{OURS}.detection.detectors"
+SIM_BUSES = f"{OURS}.simbuses"
 REASONING = tuple(
     f"{OURS}.diagnosis.{name}"
     for name in (
@@ -54,17 +70,37 @@ REASONING = tuple(
         "faulttree",
         "fmea",
         "knowledge",
+        "consistency",
+        "models",
         "prolog",
+        "symptom_sizes",
     )
 )
 """What a provider of evidence may import: the model, and libraries of its method."""
 
+METHODS = tuple(
+    f"{OURS}.detection.{name}"
+    for name in (
+        "channels",
+        "clusters",
+        "features",
+        "kalman",
+        "learnt_options",
+        "limits",
+        "schedule",
+        "transitions",
+    )
+)
+"""What a detector may import: nouns and methods that detectors share."""
+
 PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
     SOURCES: ("source", PROTOCOLS),
     MODES: ("mode", ()),
-    PROBES: ("probe", (ROS1,)),
+    PROBES: ("probe", (ROS1, ROS2)),
     EVIDENCE: ("provider of evidence", REASONING),
     ACTIONS: ("action", (ROS1,)),
+    DETECTORS: ("detector", METHODS),
+    SIM_BUSES: ("bus of the simulated robot", (ROS1, f"{OURS}.sim")),
 }
 """Packages of plugins: what one is called, and what it may import besides ``core``."""
 
@@ -73,9 +109,12 @@ READERS: Mapping[str, Sequence[str]] = {
     f"{SOURCES}.ros1": tuple(
         f"{OURS}.blackbox.columns.{name}" for name in ("ros1_text", "ros_definition")
     ),
+    f"{SOURCES}.ros2_transports": tuple(
+        f"{OURS}.blackbox.columns.{name}" for name in ("ros2_types", "ros_definition")
+    ),
 }
 """What single plugins may import besides: our own record, for the statuses that a robot's watcher
-wrote; the definitions of ROS 1 messages, for the protocol of ROS 1."""
+wrote; the definitions of ROS messages, for the protocols of ROS 1 and 2."""
 
 HEAVY = frozenset({"pyarrow", "duckdb", "zmq", "matplotlib", "pandas", "polars", "tsdownsample"})
 RECORDING = tuple(
@@ -159,7 +198,7 @@ def _may_know(package: str) -> frozenset[str]:
 def _plugin_complaints(package: str, module: str, target: str) -> Iterator[str]:
     """Judge an import of a plugin; what its package shares is in files that begin with ``_``."""
     kind, protocols = PLUGINS[package]
-    plugin = ".".join(module.split(".")[:4])
+    plugin = ".".join(module.split(".")[: package.count(".") + 2])
     readers = READERS.get(plugin, ())
     if target == package or _within(target, (plugin, f"{OURS}.core", *protocols, *readers)):
         return

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urljoin
 
 from amberbox.core.errors import AmberboxError
 from amberbox.demo.fleet import OFFERED_FAULTS
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 MOST_S, MOST_CLICKS = 60.0, 5
 FAULTS = ("localisation_crash", "laser_rear_motor_slow", "wheel_front_left_bus_disconnected")
 NUMBER, ROBOT = 2, "ropod_002"
-_WHO = "technician"
+_WHO, _ON_SITE = "technician", "operator"
 _PORT = 8643
 _ARGUMENTS = ("--no-sandbox", "--disable-dev-shm-usage")
 
@@ -130,6 +131,11 @@ def take(browser: Browser, demo: Demonstration, number: int, folder: Path) -> No
     with opened(browser, demo.links()[_WHO], width=390, height=844) as page:
         _to_answer(page, number)
         _shot(page, folder, "diagnosis-narrow", height=1100)
+    with (
+        opened(browser, demo.links()[_WHO]) as desk,
+        opened(browser, demo.links()[_ON_SITE], width=390, height=844) as phone,
+    ):
+        _experiment(desk, phone, folder)
 
 
 def _walk(page: Page, number: int, folder: Path) -> None:
@@ -147,6 +153,20 @@ def _walk(page: Page, number: int, folder: Path) -> None:
     page.get_by_role("main").get_by_role("link", name=re.compile("open alarm")).first.click()
     page.get_by_role("heading", name="Alarms").wait_for()
     _shot(page, folder, "alarms")
+
+
+def _experiment(desk: Page, phone: Page, folder: Path) -> None:
+    """Start an experiment at a desk: the first step waits for somebody with a phone."""
+    desk.goto(urljoin(desk.url, f"/robots/{ROBOT}/experiments"))
+    desk.get_by_role("link", name="Wheel check").click()
+    desk.get_by_label("I have read this.").check()
+    desk.get_by_role("button", name="Start").click()
+    desk.wait_for_url("**/runs/r-*")
+    phone.goto(urljoin(phone.url, "/tasks"))
+    phone.get_by_text("Step 1 of").wait_for()
+    _shot(desk, folder, "experiment")
+    _shot(phone, folder, "experiment-step")
+    desk.get_by_role("button", name="Abort experiment").click()
 
 
 def _to_answer(page: Page, number: int) -> None:

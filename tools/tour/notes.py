@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from amberbox.blackbox.sources.sim import FOLDER
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.timestamps import parse_time
-from amberbox.demo.fleet import KNOWLEDGE, OFFERED_FAULTS
+from amberbox.demo.fleet import OFFERED_FAULTS
 from amberbox.diagnosis.fmea.loader import FILE, load_fmea
 from amberbox.diagnosis.fmea.model import Fmea
 
@@ -124,17 +125,17 @@ def _ended_ns(line: Any) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """One fault: what it is called, the checks that it fails, its remedy and its tests."""
+    """One fault: what it is called, the components that show it, its remedy and its tests."""
 
     cause: str
-    checks: tuple[tuple[str, str], ...]
+    shown_by: frozenset[str]
     steps: tuple[str, ...]
 
     def wrong(self, notes: Notes) -> Iterator[str]:
         """Yield what somebody has written down that is not so."""
         if _plain(self.cause) not in map(_plain, notes.causes):
             yield f"it is: {self.cause}; written down: {'; '.join(notes.causes)}"
-        if not any(_tells(reason, check) for check in self.checks for reason in notes.why):
+        if not any(_plain(why).startswith(one) for one in self.shown_by for why in notes.why):
             yield f"no reason has to do with it: {'; '.join(notes.why)}"
         if _plain(notes.next) not in map(_plain, self.steps):
             yield f"what to do next neither mends it nor tells whether it is that: {notes.next}"
@@ -145,30 +146,23 @@ def truth_of(fault: str) -> Truth:
     fmea = _analysis()
     mode = fmea.modes[OFFERED_FAULTS[fault].failure_mode]
     tests = [fmea.tests[outcome.test].text for outcome in mode.tests]
-    checks = [_check(link.symptom) for link in mode.symptoms]
-    return Truth(mode.description, tuple(checks), (mode.remedy, *tests))
+    shown_by = frozenset(_component(link.symptom) for link in mode.symptoms)
+    return Truth(mode.description, shown_by, (mode.remedy, *tests))
 
 
 @cache
 def _analysis() -> Fmea:
-    fmea, _problems = load_fmea(KNOWLEDGE / FILE)
+    fmea, _problems = load_fmea(FOLDER / FILE)
     if fmea is None:
-        raise AmberboxError(f"{KNOWLEDGE / FILE} cannot be read", "amberbox fmea check")
+        raise AmberboxError(f"{FOLDER / FILE} cannot be read", "amberbox fmea check")
     return fmea
 
 
-def _check(symptom: str) -> tuple[str, str]:
-    """Return the words for a component and for its check: ``bus/devices/all_there`` is said as
-    'The fieldbus and its master: the self-check "devices: all there" fails'.
-    """
-    component, *names = symptom.split("/")
+def _component(symptom: str) -> str:
+    """Return how a reason begins that is about the component of a symptom."""
+    component = re.split("[/.]", symptom)[0]
     known = _analysis().components.get(component)
-    words = ": ".join(dict.fromkeys(names)).replace("_", " ")
-    return _plain(known.description if known else component), f'"{words}"'
-
-
-def _tells(reason: str, check: tuple[str, str]) -> bool:
-    return all(words in _plain(reason) for words in check)
+    return f"{_plain(known.description if known else component)}:"
 
 
 def _plain(text: str) -> str:
