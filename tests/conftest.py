@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,12 +26,17 @@ SKIPS: pytest.StashKey[Skips] = pytest.StashKey()
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-settings.register_profile("soak", max_examples=400)  # about twenty minutes of random histories
-settings.register_profile("ci", derandomize=True)  # the same examples every time: luck fails nobody
+# No example is timed. With "soak" random histories take about twenty minutes; in CI the examples
+# are the same every time: luck fails nobody.
+settings.register_profile("any", deadline=None)
+settings.register_profile("soak", deadline=None, max_examples=400)
+settings.register_profile("ci", deadline=None, derandomize=True)
 if os.environ.get("HYPOTHESIS_PROFILE"):
     settings.load_profile(os.environ["HYPOTHESIS_PROFILE"])
 elif os.environ.get("AMBERBOX_CI", "") not in ("", "0"):
     settings.load_profile("ci")
+else:
+    settings.load_profile("any")
 
 
 def in_ci() -> bool:
@@ -59,6 +65,37 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(config.stash[SKIPS])
     if in_ci() and config.option.durations is None:
         config.option.durations = 10
+
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a run in the background ignores it
+HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+"""How signals are handled before the first test."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Fail a test that changes for all later ones how Ctrl-C or SIGTERM are handled."""
+    changed = {
+        number: old for number, old in HANDLERS.items()
+        if (now := signal.getsignal(number)) != old and not _is_of_asyncio(now)
+    }  # fmt: skip
+    for number, old in changed.items():
+        signal.signal(number, old)
+    assert not changed, f"{item.nodeid} leaves handlers of signals behind"
+
+
+def _is_of_asyncio(handler: Any) -> bool:
+    """Return whether a running loop of a fixture has set a handler; it puts the former one back."""
+    return "asyncio" in getattr(getattr(handler, "func", handler), "__module__", "")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what only ``make soak`` runs; folders of one process begin first, being long."""
+    items.sort(key=lambda item: not item.nodeid.startswith(TOGETHER))
+    if os.environ.get("HYPOTHESIS_PROFILE") != "soak":
+        left_out = [item for item in items if item.get_closest_marker("soak")]
+        items[:] = [item for item in items if not item.get_closest_marker("soak")]
+        config.hook.pytest_deselected(items=left_out)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -21,6 +21,8 @@ from amberbox.core.errors import UsageError
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from tests.support.zmq_robot import ZmqRobot, boot_s, zmq_robot
 
+SOON_S = 10.0
+"""What comes at once, on a busy machine; what goes on by itself takes 60 s."""
 DRIVE = """\
 drive:
   kind: zmq_request
@@ -238,7 +240,7 @@ def test_abort_twice(folder: Path, robot: ZmqRobot) -> None:
     assert outcome == Outcome("aborted", "by anna")
     assert actor.step() == outcome
     assert len(robot.heard("stop")) == 1
-    assert robot.heard("stop")[0] - aborted_s < 0.5
+    assert robot.heard("stop")[0] - aborted_s < SOON_S
 
 
 def test_abort_before_it_begins(folder: Path, robot: ZmqRobot) -> None:
@@ -274,7 +276,7 @@ def test_the_parent_is_gone(folder: Path, robot: ZmqRobot) -> None:
     found = states(process)
     assert [state["state"] for state in found] == ["running", "stopping", "aborted"]
     assert found[-1]["reason"] == "lease lost: the process that held it is gone"
-    assert robot.heard("stop")[0] - ended_s < 0.5
+    assert robot.heard("stop")[0] - ended_s < SOON_S
 
 
 def test_terminated(folder: Path, robot: ZmqRobot) -> None:
@@ -307,7 +309,7 @@ def test_out_of_time(own: Own, robot: ZmqRobot) -> None:
     task = own('def act(context):\n    tell("linear")\n    context.wait(60)\n', timeout_s=0.3)
     outcome = to_end(SupervisedActor(task))
     assert outcome == Outcome("failed", "not done within 0.3 s")
-    assert robot.heard("stop")[0] - robot.heard("linear")[0] < 0.3 + 0.5
+    assert robot.heard("stop")[0] - robot.heard("linear")[0] < 0.3 + SOON_S
 
 
 def test_a_run_that_hangs_is_ended_before_the_last_stop(own: Own, robot: ZmqRobot) -> None:
@@ -325,7 +327,7 @@ def test_a_run_that_hangs_is_ended_before_the_last_stop(own: Own, robot: ZmqRobo
     outcome = to_end(actor)
     assert outcome.state == "aborted", outcome
     stops = robot.heard("stop")
-    assert stops[0] - aborted_s < 0.5
+    assert stops[0] - aborted_s < SOON_S
     assert len(stops) == 2
     assert robot.heard("linear")[-1] < stops[-1], "nothing commands it after the last stop"
     assert not robot.moving

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from amberbox.agent.process import BURST, PER_S, ChildOutput, read_all
+from amberbox.core.child_process import BURST, PER_S, ChildOutput, read_all
 
 
 @pytest.fixture

@@ -130,6 +130,29 @@ def test_what_is_no_command_is_only_recorded() -> None:
     assert found.kind == "note" and "no command" in found.text
 
 
+def test_what_cannot_be_read_is_answered_by_its_id_and_not_stored() -> None:
+    robot = Robot()
+    later = {"id": f"{7:032x}", "robot": ROBOT, "action": "lamp", "risk": "of a later version"}
+    for _ in range(2):
+        (found,) = robot.gate.receive(msgspec.msgpack.encode(later))
+        assert found.answer is not None
+        assert (found.answer.id, found.answer.number) == (later["id"], 0)
+        assert found.answer.state == "refused"
+        assert "cannot be read" in found.answer.reason
+    assert robot.gate.unanswered() == []
+    robot.give(robot.command(8))
+    (found,) = robot.gate.receive(msgspec.msgpack.encode({**later, "id": f"{8:032x}"}))
+    assert found.answer is not None and found.answer.number == 0
+    assert "other content" in found.answer.reason
+    bad: list[object] = ["../../etc", "F" * 32, 7, {}, ["0" * 32]]
+    for hostile in bad:
+        (found,) = robot.gate.receive(msgspec.msgpack.encode({**later, "id": hostile}))
+        assert (found.kind, found.id) == ("note", "")
+    nested = b"\x82\xa2id\xd9\x20" + b"0" * 32 + b"\xa1x" + b"\x91" * 60_000
+    (found,) = robot.gate.receive(nested)
+    assert found.kind == "note" and len(found.text) <= 1000
+
+
 def test_the_same_id_with_other_content_is_refused() -> None:
     robot = Robot()
     robot.give(robot.command())
@@ -216,6 +239,21 @@ def test_a_code_may_be_tried_three_times() -> None:
     robot.gate.confirmed("000001")
     assert "3 times" in reason(robot.gate.confirmed("000002"))
     assert kinds(robot.gate.confirmed(ask.code)) == []
+
+
+def test_a_code_counts_only_for_its_command() -> None:
+    robot = Robot()
+    (ask,) = robot.give(robot.command(1, action="drive"))
+    waiting = robot.gate.waiting()
+    assert waiting is not None and (waiting.id, waiting.by_code) == (ask.id, True)
+    for _ in range(5):
+        assert kinds(robot.gate.confirmed(ask.code, order(2).id)) == []
+    assert robot.gate.waiting() == waiting, "these were no tries"
+    robot.gate.confirmed("000000", ask.id)
+    tried = robot.gate.waiting()
+    assert tried is not None and tried.tries == 1
+    assert kinds(robot.gate.confirmed(ask.code, ask.id)) == ["accepted", "run"]
+    assert robot.gate.waiting() is None
 
 
 def test_a_late_confirmation_counts_for_nothing() -> None:

@@ -1,9 +1,10 @@
 """Whatever happens to robot, link and servers, commands run once, in time, by those who may.
 
 Random histories of a gate on a simulated disk: orders that are lost, come twice, late, changed or
-for somebody else; kills and power cuts at any system call, reboots, a wall clock that steps by a
-day, full and failing disks, two servers, one that was restored and sends everything again. A model
-that knows what truly happened judges each decision.
+for somebody else; orders of somebody at the robot and of its recovery policy; kills and power cuts
+at any system call, reboots, a wall clock that steps by a day, full and failing disks, two servers,
+one that was restored and sends everything again. A model that knows what truly happened judges each
+decision.
 
 ``HYPOTHESIS_PROFILE=soak`` runs many more of them, others each time.
 """
@@ -30,6 +31,7 @@ from amberbox.core.command import (
     CommandAnswer,
     CommandError,
     LeaseState,
+    OrderLimit,
     Risk,
     decode_command,
     encode_command,
@@ -56,6 +58,8 @@ HISTORIES = 30_000 if SOAKING else 1000
 STEPS = 80
 TRAIL = 60
 DAY_S = 86_400
+RULE = "lamp#broken lamp"
+LIMIT = OrderLimit(2, 60.0)
 PATH = Path("/store/commands.log")
 PEOPLE = {person.key_id: person for person in (ANNA, BEN, EVE)}
 
@@ -78,6 +82,7 @@ class HeldLease:
     run: str
     renewed_ns: int
     keys: set[str] = field(default_factory=set)
+    order: str = ""
 
 
 @dataclass
@@ -131,6 +136,12 @@ class World:
         self.asked: Asked | None = None
         self.is_confirming = False
         self.started_runs = 0
+        # orders of the robot itself: who gave them, and when those of the rule began in true time
+        self.orders: dict[str, str] = {}
+        self.ordering = ""
+        self.is_on_site = False
+        self.true_ns = 0
+        self.attempts: list[int] = []
         self.open()
 
     # -- the robot's processes
@@ -202,6 +213,7 @@ class World:
 
     def new_boot(self) -> None:
         self.clock.boot = self.random.randint(5, 200) * NS
+        self.true_ns += self.clock.boot
         self.clock.boot_name = f"{self.random.getrandbits(64):x}"
         if self.random.random() < 0.3:
             self.clock.wall = 0  # without a clock of its own it is 1970
@@ -222,6 +234,7 @@ class World:
                 self.asked = Asked(decision.command, decision.code, self.clock.boot)
             elif decision.kind == "answer":
                 assert decision.answer is not None
+                assert decision.is_local == (decision.id in self.orders)
                 self.answered(decision.answer)
 
     def answered(self, answer: CommandAnswer) -> None:
@@ -250,14 +263,33 @@ class World:
         assert least is not None and RISKS.index(command.risk) >= RISKS.index(least)
         assert "bad" not in command.parameters
         assert command.id not in self.aborted, "nothing runs that was aborted"
-        if command.risk != "record":
+        if command.id in self.orders:
+            self.start_order(command)
+        elif command.risk != "record":
             self.check_signed(command, is_waiting=self.is_confirming)
-        if command.risk == "moves":
+        if command.risk == "moves" and command.id not in self.orders:
             assert self.is_confirming, "nothing moves without confirmation"
             assert self.asked is not None and self.asked.command == command
             assert self.clock.boot - self.asked.asked_ns <= 30 * NS, "no late confirmation"
             self.asked = None
         self.started[command.id] = self.running[command.id] = command
+
+    def start_order(self, command: Command) -> None:
+        """An order of the robot itself starts: it has the robot, and as often as it may."""
+        assert command.id == self.ordering, "it starts when it is given, or never"
+        who = self.orders[command.id]
+        if who == "policy":
+            young = [at for at in self.attempts if self.true_ns - at <= LIMIT.per_s * NS]
+            assert len(young) < LIMIT.most, "no rule orders more often than it may"
+            self.attempts.append(self.true_ns)
+        if command.risk == "record":
+            return
+        assert self.lease is None, "nothing runs against the lease of another one"
+        assert not any(c.risk != "record" for c in self.running.values()), "what runs has stopped"
+        assert command.risk != "moves" or (self.is_on_site and who != "policy")
+        assert self.log.lease_number > self.lease_number, "the number of a lease only grows"
+        self.lease_number = self.log.lease_number
+        self.lease = HeldLease(self.lease_number, who, "", self.clock.boot, order=command.id)
 
     def check_signed(self, command: Command, *, is_waiting: bool = False) -> None:
         why = self.verdict(command, is_waiting=is_waiting)
@@ -285,7 +317,8 @@ class World:
             if self.clock.boot - minted_ns > signature.ttl_s * NS:
                 return "late"
         lease = self.lease
-        if lease is None or (lease.number, lease.run) != (signature.lease, command.run):
+        given = (signature.lease, command.run)
+        if lease is None or lease.order or (lease.number, lease.run) != given:
             return "no lease"
         return "lost" if self.clock.boot - lease.renewed_ns > 3 * NS else ""
 
@@ -397,12 +430,14 @@ class World:
     def pass_time(self) -> None:
         """Time passes, mostly with a lease that is renewed."""
         self.renew()
+        since_ns = self.clock.boot
         step_s = self.random.choice([0.1, 0.5, 1.0, 1.0, 2.9, 3.0, 3.1, 20.0, 61.0])
         is_renewing = self.random.random() < 0.7
         for _ in range(int(step_s) if is_renewing and step_s > 3 else 1):
             self.clock.advance(1.0 if is_renewing and step_s > 3 else step_s)
             if is_renewing:
                 self.renew()
+        self.true_ns += self.clock.boot - since_ns
         self.tick()
 
     def step_wall_clock(self) -> None:
@@ -444,6 +479,9 @@ class World:
             found.append(self.gate.take_lease(holder, run))
             return self.gate.step()
 
+        if held is not None and held.order and self.random.random() < 0.5:
+            holder, run = held.holder, ""  # a server that passes for who holds it
+
         is_sound, before = not self.disk.failures, len(self.trail)
         self.act(f"{holder} takes the lease", taking)
         if "   dies in it" in self.trail[before:]:
@@ -460,8 +498,39 @@ class World:
             self.lease_number = state.number
             self.lease = HeldLease(state.number, holder, run, self.clock.boot)
 
+    def give_order(self) -> None:
+        """Somebody at the robot, or its policy, orders something."""
+        self.tick()
+        random = self.random
+        self.next_id += 1
+        command_id = f"a{self.next_id:031x}"
+        who = random.choice(["nico", "policy"])
+        action = random.choice(["lamp", "lamp", "drive", "journal.rotate", "nothing"])
+        parameters = '{"bad": 1}' if random.random() < 0.05 else "{}"
+        self.orders[command_id] = who
+        self.ordering, self.is_on_site = command_id, random.random() < 0.8
+        is_free = self.lease is None and all(c.risk == "record" for c in self.running.values())
+        is_sure = not self.disk.failures and not self.disk.die_in
+
+        def ordering() -> list[Decision]:
+            return self.gate.order(
+                command_id, action, parameters, who, is_confirmed=self.is_on_site,
+                rule=RULE if who == "policy" else "", limit=LIMIT if who == "policy" else None,
+            )  # fmt: skip
+
+        self.act(f"{who} orders {action}", ordering, command_id)
+        if is_free and is_sure and who == "nico" and action == "lamp" and parameters == "{}":
+            assert command_id in self.started, "what is right runs"
+        if random.random() < 0.2:
+            self.act("orders it again", ordering, command_id)
+            self.act("with other content", lambda: self.gate.order(command_id, "lamp", "[]", who))
+        self.ordering = ""
+
     def renew(self) -> None:
         if self.lease is None:
+            return
+        if self.lease.order:
+            self.renew_order(self.lease)
             return
         number = self.lease.number - (self.random.random() < 0.02)
         found: list[LeaseState] = []
@@ -479,11 +548,26 @@ class World:
             if is_good:
                 self.lease.renewed_ns = self.clock.boot
 
+    def renew_order(self, held: HeldLease) -> None:
+        """Its order renews a lease, and a server that has read its number tries to."""
+        renewed: list[bool] = []
+
+        def renewing() -> list[Decision]:
+            assert self.gate.renew(held.number).reason, "only the order renews its own lease"
+            renewed.append(self.gate.renew_order(held.order))
+            return []
+
+        self.act("renews its order", renewing)
+        if renewed:
+            assert renewed[0] == (self.clock.boot - held.renewed_ns <= 3 * NS)
+            held.renewed_ns = self.clock.boot if renewed[0] else held.renewed_ns
+
     def release(self) -> None:
         if self.lease is None or self.random.random() < 0.5:
             return
         number = self.lease.number
-        self.lease = None
+        if not self.lease.order:
+            self.lease = None
         self.act("releases", lambda: self.gate.release(number))
 
     def confirm(self) -> None:
@@ -518,6 +602,8 @@ class World:
         if chosen in self.running:
             self.ending[chosen] = state
             del self.running[chosen]
+            if self.lease is not None and self.lease.order == chosen:
+                self.lease = None
         self.act(f"{chosen[-3:]} ends", lambda: self.gate.ended(chosen, state, "", "{}"))  # type: ignore[arg-type]  # a literal
 
     def abort(self) -> None:
@@ -587,6 +673,7 @@ class World:
     def contact(self) -> None:
         """The link is back: answers and acknowledgements, and all that is unanswered again."""
         answers = self.gate.unanswered()
+        assert not {answer.id for answer in answers} & self.orders.keys(), "servers ordered none"
         assert [a.number for a in answers] == sorted(a.number for a in answers)
         for answer in answers:
             self.answered(answer)
@@ -632,8 +719,9 @@ class World:
     def live(self) -> None:
         steps = [
             (self.new_order, 22), (self.deliver, 28), (self.pass_time, 10), (self.mint, 8),
-            (self.take_lease, 8), (self.confirm, 14), (self.end, 9), (self.abort, 2),
-            (self.revoke, 3), (self.change_trust, 1), (self.contact, 4), (self.restore_server, 1),
+            (self.take_lease, 8), (self.give_order, 8), (self.confirm, 14), (self.end, 9),
+            (self.abort, 2), (self.revoke, 3), (self.change_trust, 1), (self.contact, 4),
+            (self.restore_server, 1),
             (self.break_disk, 2), (self.arm, 3), (self.lose, 4), (self.release, 1),
             (self.step_wall_clock, 3), (self.tick, 4), (lambda: self.crash(), 2),
         ]  # fmt: skip
@@ -680,11 +768,14 @@ def run_history(seed: int) -> World:
 
 def test_random_histories() -> None:
     first = time.time_ns() // 1000 if SOAKING else 0
-    moved = states = unknown = 0
+    moved = states = unknown = orders = limited = 0
     for seed in range(first, first + HISTORIES):
         world = run_history(seed)
         moved += sum(c.risk == "moves" for c in world.started.values())
         states += sum(c.risk == "state" for c in world.started.values())
         unknown += len(world.unknown)
+        orders += len(world.orders.keys() & world.started.keys())
+        limited += len(world.attempts) >= LIMIT.most
     # a model that nothing reaches would find nothing
-    assert min(moved, states, unknown) > HISTORIES / 20, (moved, states, unknown)
+    counts = moved, states, unknown, orders, limited
+    assert min(counts) > HISTORIES / 20, counts

@@ -204,3 +204,21 @@ def test_a_log_that_cannot_be_opened_is_an_error_with_a_hint(call: str) -> None:
     with pytest.raises(CommandLogError, match=r"commands\.log") as error:
         CommandLogFile(PATH, disk)
     assert error.value.hint
+
+
+def test_orders_of_the_robot_itself_are_counted_and_kept_from_servers() -> None:
+    disk = SimulatedDisk(Random(0))
+    log = CommandLogFile(PATH, disk, most_ids=5, tidy_bytes=0)
+    log.add(answer(1), DIGEST, "policy a")
+    log.add(answer(2, "refused"), DIGEST, "policy a")
+    log.add(answer(3), DIGEST, "policy a")
+    log.add(answer(1, "done"), DIGEST)  # as after a restart, which knows no origin
+    log.add(answer(4), DIGEST, "site")
+    for number in range(5, 20):
+        log.add(answer(number, "done"), DIGEST)
+    log.tidy()
+    for again in (log, CommandLogFile(PATH, disk, most_ids=5, tidy_bytes=0)):
+        counted = [(one.id[-1], one.state) for one in again.attempts("policy a")]
+        assert counted == [("1", "done"), ("3", "accepted")]
+        assert again.origin(answer(4).id) == "site" and again.origin(answer(19).id) == ""
+        assert {int(one.id, 16) for one in again.unanswered()} == {18, 19}

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.agent.process import SUPERVISED_MARK, ChildOutput, ChildProcess, Process, RealProcess
+from amberbox.agent.process import SUPERVISED_MARK, ChildProcess, Process, RealProcess
 from amberbox.agent.supervisor import ChildLifecycle
+from amberbox.core.child_process import ChildOutput
 from amberbox.core.pacing import Backoff
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from tests.agent.fake_process import FakeLauncher
@@ -153,7 +154,8 @@ def test_one_that_nobody_listens_to_is_not_held_up(lifecycles: Begin) -> None:
 PARENT = """\
 import sys, time
 sys.path[:0] = {path!r}
-from amberbox.agent.process import ChildOutput, ChildProcess, RealProcess
+from amberbox.agent.process import ChildProcess, RealProcess
+from amberbox.core.child_process import ChildOutput
 command = [sys.executable, "-S", "-c", "import os, time; os.write(1, b'up'); time.sleep(60)"]
 def say(text): pass
 made = []

@@ -92,6 +92,20 @@ def test_no_planted_secret_leaves_the_folder(planted: Path) -> None:
     assert b"url: https://fleet.example" in sent["robot.yaml"]
 
 
+def test_pictures_are_sent_without_what_is_secret_in_their_text(planted: Path) -> None:
+    place = planted / "experiments"
+    place.mkdir()
+    (place / "way.png").write_bytes(b"\x89PNG\r\n\x1a\n\0")
+    (place / "way.svg").write_text(f"<svg><password>{PLANTED}</password></svg>")
+    (place / "outside.png").symlink_to("/etc/passwd")
+    folder = load_folder(planted)
+    assert not {*unpack(packed_folder(folder))} & {"experiments/way.png", "experiments/way.svg"}
+    sent = unpack(packed_folder(folder, pictures=True))
+    assert sent["experiments/way.png"] == b"\x89PNG\r\n\x1a\n\0"
+    assert sent["experiments/way.svg"] == b"<svg><password>(masked)</password></svg>"
+    assert "experiments/outside.png" not in sent
+
+
 def test_what_is_sent_loads_as_the_folder_did(planted: Path, tmp_path: Path) -> None:
     sent = unpack(packed_folder(load_folder(planted)))
     copy = tmp_path / "copy"

@@ -270,7 +270,7 @@ def test_a_folder_that_joins_a_server_is_linked_from_then_on(bench: SupervisorBe
     joined(bench)
     bench.judgement = FolderVerdict(True, "", "two")
     bench.pass_(10)
-    assert sorted(bench.launcher.names) == ["link", "record", "watch", "watch"]
+    assert sorted(bench.launcher.names) == ["act", "link", "record", "watch", "watch"]
     assert bench.supervisor._last_state["link"]["state"] == "starting"
 
 

@@ -15,7 +15,10 @@ from amberbox.blackbox.robot_folder.folder import (
     planned_items,
 )
 from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
+from amberbox.blackbox.store.store import create_store
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import event_texts, recording
 
 CONFIGS = Path(__file__).parent / "configs"
 MINIMAL = "- ros: {topics: [{name: /odom}]}\n"
@@ -32,6 +35,13 @@ def errors(place: Path) -> str:
     with pytest.raises(ConfigurationError) as caught:
         load_folder(place)
     return str(caught.value)
+
+
+def recorded(place: Path, file: Path) -> RobotFolder:
+    """Load a file as the black box of a folder that has recorded."""
+    shutil.copy(file, place / "black_box.yaml")
+    create_store(place / "store").next_run()
+    return load_folder(place)
 
 
 def marks(path: Path, mark: str) -> dict[int, str]:
@@ -52,45 +62,84 @@ def test_every_error_is_at_its_line_and_all_come_at_once(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.good.yaml")), ids=lambda path: path.name)
-def test_good_files_load_with_their_notes(path: Path) -> None:
-    built = load_folder(path)
-    notes = {note.line: str(note) for note in built.notes if note.file == str(path)}
+def test_good_files_load_with_their_notes(path: Path, tmp_path: Path) -> None:
+    notes = {note.line: str(note) for note in recorded(tmp_path, path).notes if note.line > 1}
     for line, words in marks(path, "#? ").items():
         assert words in notes.pop(line)
     assert all("is not built yet" in note for note in notes.values())
 
 
-def test_the_papers_listing() -> None:
-    built = load_folder(CONFIGS / "paper.good.yaml")
-    (ros,) = built.blocks
+def test_a_block_without_a_source_is_an_error_until_the_folder_has_recorded(
+    tmp_path: Path,
+) -> None:
+    text = """\
+        - ros: {ros_master_uri: "http://127.0.0.1:1", topics: [{name: /odom}]}
+        - opcua: {}
+        - foxglove: {}
+        - zyer: {}
+        """
+    found = errors(folder(tmp_path, text))
+    assert "black_box.yaml:2: opcua: source 'opcua' is not built yet" in found
+    assert "hint: take the block out" in found
+    assert "black_box.yaml:3: foxglove: 'foxglove' is no source" in found
+    assert "hint: write - ros2: {via: bridge}" in found
+    assert "black_box.yaml:4: zyer: there is no source 'zyer'; did you mean 'zyre'?" in found
+    folder(tmp_path, text.replace("        - zyer: {}\n", ""))
+    store = create_store(tmp_path / "store")
+    assert "source 'opcua' is not built yet" in errors(tmp_path), "an empty store is no record"
+    store.next_run()
+    built = load_folder(tmp_path)
+    assert built.not_built == ("opcua", "foxglove")
+    assert [block.name for block in built.blocks] == ["ros"]
+    assert "source 'opcua' is not built yet: the block is not recorded" in str(built.notes[0])
+    with recording(tmp_path) as recorder:
+        wait_until(lambda: event_texts(recorder.store.path, "started"), "the recorder runs")
+    assert event_texts(recorder.store.path, "source_missing") == [
+        f"there is no source '{name}': its block of black_box.yaml is not recorded"
+        for name in ("opcua", "foxglove")
+    ]
+
+
+def test_the_papers_listing(tmp_path: Path) -> None:
+    built = recorded(tmp_path, CONFIGS / "paper.good.yaml")
+    ros, ethercat, zyre = built.blocks
     assert (ros.plugin, ros.name, ros.line) == ("ros", "ros", 3)
+    assert (zyre.plugin, zyre.config.name, zyre.config.groups) == ("zyre", "black_box", ("ROPOD",))
+    assert zyre.config.message_types == ("TASK",)
     (odom,) = ros.config.topics
     assert odom.name == "/ropod/odom"
     assert odom.type == "nav_msgs/Odometry"
     assert odom.variable_names == ("pose/pose/position/x", "pose/pose/position/y")
     assert odom.max_frequency == 5
-    assert built.not_built == ("ethercat", "zyre")
+    assert [topic.name for topic in ethercat.config.listed()[:2]] == ["commands", "sensors"]
+    assert built.not_built == ()
 
 
 @pytest.mark.needs_data
-def test_the_ropod_files_load_without_an_error(shared_data: Path) -> None:
+def test_the_ropod_files_load_once_they_have_recorded(shared_data: Path, tmp_path: Path) -> None:
     paths = sorted((shared_data / "ropod" / "black_box_configs").glob("*.yaml"))
     assert len(paths) == 5
     for path in paths:
-        built = load_folder(path)
+        _, problems = inspect_folder(path)
+        wrong = {problem.what for problem in problems if problem.is_error}
+        assert wrong == set()
+        built = recorded(tmp_path, path)
         whats = {note.what for note in built.notes}
         assert "ignored, use robot.yaml store.quota" in whats
         assert "ignored, use robot.yaml store.rotate_mb" in whats
-        assert all(topic.max_frequency for block in built.blocks for topic in block.config.topics)
-    assert [block.name for block in load_folder(paths[0]).blocks] == ["ros", "zmq"]
-    assert load_folder(paths[0]).not_built == ("zyre", "ethercat")
-    assert load_folder(paths[1]).not_built == ("event", "zyre")
+        with_topics = [b.config for b in built.blocks if b.plugin != "ethercat"]
+        assert all(topic.max_frequency for config in with_topics for topic in config.topics)
+        zyre = [block.config for block in built.blocks if block.plugin == "zyre"]
+        assert all(config.groups == ("ROPOD",) and config.message_types for config in zyre)
+        assert built.not_built == ()
+    first = recorded(tmp_path, paths[0])
+    assert [block.name for block in first.blocks] == ["ros", "zmq", "zyre", "ethercat"]
 
 
 @pytest.mark.needs_data
-def test_every_metadata_key_of_the_ropod_files_is_noted(shared_data: Path) -> None:
+def test_every_metadata_key_of_the_ropod_files_is_noted(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "ropod" / "black_box_configs" / "data_sources.yaml"
-    noted = [note for note in load_folder(path).notes if note.where.endswith(".metadata")]
+    noted = [note for note in recorded(tmp_path, path).notes if note.where.endswith(".metadata")]
     written = path.read_text().splitlines()
     assert [note.line for note in noted] == [
         i for i, line in enumerate(written, 1) if line.strip() == "metadata:"
@@ -115,7 +164,6 @@ def test_blocks_may_be_keys_of_one_mapping(tmp_path: Path) -> None:
     text = """\
         default_parameters: {max_frequency: 7}
         ros: {topics: [{name: /a}]}
-        zyre: {}
         """
     built = load_folder(folder(tmp_path, text))
     assert [block.name for block in built.blocks] == ["ros"]

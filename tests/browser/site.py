@@ -11,19 +11,32 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from fastapi import FastAPI
+from sqlalchemy import update
 
 from amberbox.core.clock import NS
+from amberbox.core.command import Command
 from amberbox.link.connection import LinkOptions
 from amberbox.link.folders import pack
+from amberbox.server import commands
 from amberbox.server.accounts.sessions import begin_session
 from amberbox.server.accounts.tokens import add_token
 from amberbox.server.accounts.users import find_user
 from amberbox.server.alarms.alarm import Alarm
 from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.experiments import runs
 from amberbox.server.http.auth import COOKIE
-from amberbox.server.schema import ALARM, ALARM_ROBOT, HISTORY, ROBOT
+from amberbox.server.schema import (
+    ALARM,
+    ALARM_ROBOT,
+    COMMAND,
+    COMMAND_ANSWER,
+    COMMAND_ROBOT,
+    HISTORY,
+    ROBOT,
+)
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from tests.browser import hostile, record, story
 from tests.browser.robot import Robot, RobotClock
@@ -184,11 +197,60 @@ def _fill(home: House, folder: Path, now_ns: int, boot: str) -> None:
     _away(home, folder, now_ns)
     home.services.archive.commit(0)
     _hand_in(home, one, [late])
-    model = {"robot.yaml": b"id: ropod_001\nmodel: Ropod 2\n"}
+    model = {"robot.yaml": b"id: ropod_001\nmodel: Ropod 2\n", **hostile.model_files()}
     odd = {"robot.yaml": f"id: ropod_002\nmodel: {json.dumps(hostile.MODEL)}\n".encode()}
     for name, hash_, more in (("ropod_001", sim.HASH, model), ("ropod_002", HASH_2, odd)):
         assert home.services.folders.keep(name, hash_, pack({**sim.files(), **more}))
     _old_alarms(home, now_ns)
+    _command(home, now_ns)
+    _runs(home, now_ns)
+
+
+def _runs(home: House, now_ns: int) -> None:
+    """Let ``ropod_002`` have a run that was aborted, and another that waits for a person."""
+    runner = home.services.runner
+    found = runner.shelf.upload(hostile.EXPERIMENT, hostile.experiment_files(), "technician")
+    order = runs.RunOrder("ropod_002", "experiment", found.name, found.title, found.sha256,
+                          {"way_m": 1}, "technician")  # fmt: skip
+    for run, is_over in ((hostile.EARLIER_RUN, True), (hostile.RUN, False)):
+        with (
+            patch.object(runs, "new_run_id", return_value=run),
+            home.services.database.begin() as c,
+        ):
+            stored = runs.add(c, now_ns, order)
+            runner.register.begin(c, stored, {"technician": "technician"}, "technician")
+        runner.register.change(stored, lambda r, _, at: r.note(hostile.NOTE, "operator", at))
+        if is_over:
+            runner.register.change(stored, lambda r, _, at: r.abort("operator", hostile.NOTE, at))
+
+
+def _command(home: House, now_ns: int) -> None:
+    """Let ``ropod_001`` have announced actions, and have refused one of two orders."""
+    actions = [
+        {"name": "drive", "risk": "moves", "description": hostile.SCRIPT, "parameters": {
+            "distance_m": {"type": "float", "unit": hostile.MARKUP, "min": -2, "max": 2},
+            "to": {"type": "string", "choices": ["left", hostile.TEMPLATE], "default": "left"}}},
+        {"name": "restart_driver", "risk": "state", "description": hostile.TEMPLATE * 20},
+    ]  # fmt: skip
+    row = {"robot": "ropod_001", "store_id": "s", "answered": 1, "lease": 3, "run": hostile.SCRIPT,
+           "holder": "", "actions": json.dumps({"actions": actions}),
+           "actions_ns": now_ns}  # fmt: skip
+    orders = [
+        Command(id_, "ropod_001", "drive", json.dumps({"to": hostile.MARKUP}), hostile.TEMPLATE,
+                "moves", run=hostile.SCRIPT)
+        for id_ in (hostile.COMMAND, "0" * 32)
+    ]  # fmt: skip
+    refusal = {"robot": "ropod_001", "store_id": "s", "command": hostile.COMMAND, "number": 1,
+               "state": "refused", "reason": hostile.NOTE, "result": hostile.SCRIPT * 200,
+               "at_ns": now_ns, "boot": "b", "mono_ns": 1, "received_ns": now_ns}  # fmt: skip
+    over = update(COMMAND).where(COMMAND.c.id == hostile.COMMAND)
+    with home.services.database.begin() as connection:
+        connection.execute(COMMAND_ROBOT.insert(), [row])
+        for one in orders:
+            commands.intend(connection, now_ns, one, 3600 * NS)
+        connection.execute(COMMAND_ANSWER.insert(), [refusal])
+        connection.execute(over.values(state="refused", reason=hostile.NOTE, answered_ns=now_ns))
+        commands.revoke(connection, now_ns, "ab" * 8, "technician", hostile.NOTE)
 
 
 def _hand_in(home: House, robot: Recorded, paths: Iterable[Path]) -> None:

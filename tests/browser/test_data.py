@@ -294,6 +294,7 @@ def test_a_restart_loses_nothing(page_as: PageAs, site: Site) -> None:
     page.locator(".plot-hands").focus()
     for key in ("+", "ArrowRight"):
         page.keyboard.press(key)
+    drawn(page, 1)
     url, cursor = page.url, page.locator(".plot-time").inner_text()
     site.restart()
     expect(page.locator("html")).to_have_attribute("data-feed", "live")

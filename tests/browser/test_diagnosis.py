@@ -11,6 +11,7 @@ from playwright.sync_api import expect
 
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
+from amberbox.testing.clock import wait_until
 from tests.browser.conftest import PageAs
 from tests.browser.page_checks import axe, judge, no_sideways_scroll, shot
 from tests.browser.site import HASH_2, Site
@@ -34,6 +35,8 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     heading = DiagnosisId(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
     found = answer(knowledge(ROBOT, HASH_2), ObservedSituation((silent,), watched=True), heading)
     robot.say(silent, found)
+    diagnoses = f"/robots/{ROBOT}/diagnoses"
+    wait_until(lambda: site.ask(diagnoses)[0]["id"] == found.id, "the server knows it")
     yield f"/robots/{ROBOT}/diagnosis"
     then_ns = robot.clock.wall_ns()
     gone = Symptom(NO_SCANS, "absent", NO_SCANS, None, then_ns)
@@ -159,7 +162,7 @@ def test_what_if_and_back(page_as: PageAs) -> None:
 def test_rules_are_asked_with_keys_alone(page_as: PageAs) -> None:
     page = opened(page_as("operator"), f"{BASE}?details=1")
     page.get_by_role("tab", name="Candidates").focus()
-    for _ in range(3):
+    for _ in range(4):
         page.keyboard.press("ArrowRight")
     expect(page.get_by_role("tab", name="Rules")).to_be_focused()
     expect(page.get_by_label("Goal")).to_be_visible()

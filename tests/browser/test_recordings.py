@@ -105,11 +105,13 @@ def test_what_others_do_appears_by_itself(page_as: PageAs) -> None:
     page, other = page_as("viewer"), page_as("operator")
     page.goto("/recordings/ropod_002")
     other.goto("/recordings/ropod_002")
-    expect(page.get_by_text("No incident")).to_be_visible()
+    incidents = page.locator("#incidents")
+    expect(incidents).to_be_visible()
+    expect(incidents).not_to_contain_text("it smells burnt")
     window = {"from": "now-5m", "to": "now", "reason": "it smells burnt"}
     posted = other.evaluate(_POST, ["/api/v1/robots/ropod_002/incidents", window])
     page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # not in 10 s: now
-    expect(page.locator("#incidents")).to_contain_text("it smells burnt")
+    expect(incidents).to_contain_text("it smells burnt")
     other.evaluate(_POST, [f"/api/v1/robots/ropod_002/incidents/{posted['id']}/release", {}])
     page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")
     expect(page.locator("#incidents")).to_contain_text("released")

@@ -269,7 +269,7 @@ def is_well(site: Site) -> bool:
     return found.card["level"] == "ok" and len(found.levels) > 15 and not found.active
 
 
-@pytest.mark.alone  # it keeps all cores busy
+@pytest.mark.soak  # it keeps all cores busy
 @pytest.mark.timeout(1800)
 def test_a_technicians_day(tmp_path: Path, page_as: PageAs) -> None:
     faults = DAY[: int(os.environ.get("DAY_FAULTS", FEW))]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.blackbox.store.store import open_store
-from amberbox.consult.folder_knowledge import load_diagnoser
+from amberbox.consult.context import load_diagnoser
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.plan_loader import load_plan

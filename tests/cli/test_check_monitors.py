@@ -136,12 +136,95 @@ def test_a_folder_without_components(laser: Path, capsys: pytest.CaptureFixture[
     assert "would monitor" not in capsys.readouterr().out
 
 
-def test_recovery_actions_are_shown(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+RECOVERY = """\
+recovery_actions: [restart it, restart unit=laser.service, restart unit=laser, rstart unit=x]
+"""
+RESTART = """\
+restart:
+  kind: shell
+  command: [systemctl, restart, "{unit}"]
+  parameters: {unit: {choices: [laser.service, b.service]}}
+  risk: state
+move: {kind: shell, command: [move], safe_stop: [halt], risk: moves}
+"""
+
+
+@pytest.fixture
+def recovered(laser: Path) -> Path:
+    """Return a folder with recovery actions, and an action that two of them stand for."""
     component = laser / "components" / "laser.yaml"
-    component.write_text(component.read_text() + "recovery_actions: [restart]\n")
-    assert main(["check", str(laser)]) == 0
+    component.write_text(component.read_text() + RECOVERY)
+    (laser / "components" / "recovery_config.yaml").write_text(
+        "laser: {monitor: laser/heartbeat, restart: b.service, component_type: systemd}\n"
+    )
+    (laser / "actions").mkdir()
+    (laser / "actions" / "all.yaml").write_text(RESTART)
+    return laser
+
+
+def test_recovery_actions_are_those_that_can_be_run_or_texts(
+    recovered: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(recovered), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    run = f"amberbox action run {recovered} restart unit="
+    commands = [one["command"] for one in found["recovery_actions"]]
+    assert commands == ["", f"{run}laser.service", "", "", f"{run}b.service"]
+    problems = [one["problem"] for one in found["recovery_actions"]]
+    assert problems[:2] == ["", ""] and "is none of" in problems[2]
+    assert "did you mean 'restart'" in problems[3]
+    recovers = {action["name"]: action["recovers"] for action in found["actions"]}
+    assert recovers == {"restart": ["laser"], "move": []}
+    assert main(["check", str(recovered)]) == 0
     text = capsys.readouterr().out
-    assert "recovery actions, not carried out:\n  laser  restart\n" in text
+    assert "  laser  restart unit=laser.service\n" in text
+    assert "  laser  only a text: restart it\n" in text
+
+
+def test_rules_of_recovery_name_what_there_is(
+    recovered: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (recovered / "robot.yaml").open("a") as file:
+        file.write("""
+recovery:
+  - {when: laser, do: restart, with: {unit: b.service}, at_most: 3 per 1 h}
+  - {when: lasr, do: restrt, at_most: 3 per 1 h}
+  - {when: laser/heartbeet, do: move, at_most: 3 per 1 h}
+  - {when: "laser#crash", do: restart, with: {unit: c}, at_most: 3 per 1 h}
+""")
+    assert main(["check", str(recovered)]) == 2
+    text = capsys.readouterr().out
+    for place, what in (
+        ("recovery[1].do", "there is no action 'restrt'; did you mean 'restart'?"),
+        ("recovery[1].when", "there is no component or mode 'lasr'; did you mean 'laser'?"),
+        ("recovery[2].do", "move moves the robot"),
+        ("recovery[2].when", "there is no component or mode 'laser/heartbeet'"),
+        ("recovery[3].with", "unit: 'c' is none of"),
+        ("recovery[3].when", "there is no failure mode 'laser#crash': there is no fmea.yaml"),
+    ):
+        assert any(f": {place}: " in row and what in row for row in text.splitlines()), place
+    assert "recovery[0]" not in text
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ("at_most: 3 per", "is no limit; write: 3 per 1 h"),
+        ("at_most: 3 per 1 s", "must be per 1 min or longer"),
+        ("at_most: 1000 per 1 h", "from 1 to 100"),
+        ("at_most: 1 per 1 h, wait: 2 d", "from 0 to 1 d"),
+        ("at_most: 1 per 1 h, if: battery >", "expression"),
+        ("wait: 1 s", "at_most"),
+        ("at_most: 1 per 1 h, with: {unit: .nan}", "must be numbers"),
+    ],
+)
+def test_a_rule_of_recovery_has_limits(
+    recovered: Path, capsys: pytest.CaptureFixture[str], line: str, what: str
+) -> None:
+    with (recovered / "robot.yaml").open("a") as file:
+        file.write(f"\nrecovery: [{{when: laser, do: restart, {line}}}]\n")
+    assert main(["check", str(recovered)]) == 2
+    assert what in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("level", "code"), [("ok", 0), ("error", 2)])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.agent.doctor.subject import DoctorFinding, error, ok, warn
-from amberbox.cli.box import report
+from amberbox.cli.doctor import report
 from amberbox.cli.main import main
 from tests.support.manual_recorder import recording
 

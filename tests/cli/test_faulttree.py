@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from amberbox.cli.main import main
+from amberbox.diagnosis.faulttree.analysis import analyse
 from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
 from amberbox.diagnosis.faulttree.tree import all_of, any_of, at_least, fault_tree, none_of
+from benchmarks.fault_tree_plants import PlantShape, plant
 
 GATES = {
     "stranded": any_of("no_drive", "power"),
@@ -111,6 +113,7 @@ def test_one_gate_of_many_and_export(
     [
         (["--order", "-1"], "--order must be 0 or more"),
         (["--cut-sets", "0"], "--cut-sets must be 1 or more"),
+        (["--most-probable", "0"], "--most-probable must be 1 or more"),
         (["--seconds", "nan"], "--seconds must be a number, 0 or more"),
         (["--effect", "strandet"], "did you mean 'stranded'"),
         (["--exposure", "3"], "a file has its own probabilities"),
@@ -150,3 +153,44 @@ def test_a_model_may_be_spread_over_files(
     assert "amberbox faulttree A.xml B.xml" in capsys.readouterr().err
     assert main(["faulttree", str(tmp_path), str(events)]) == 2
     assert "several can be given of FILE.xml only" in capsys.readouterr().err
+
+
+def test_the_most_probable_cut_sets_with_their_share(
+    file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["faulttree", file, "--json", "--most-probable", "2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    best = found["most_probable"]
+    assert [entry["events"] for entry in best["cut_sets"]] in (
+        [["left", "rear"], ["rear", "right"]], [["rear", "right"], ["left", "rear"]]
+    )  # fmt: skip
+    assert best["certain"] == 2 and found["probability_bounds"] == [found["top_probability"]] * 2
+    both = 0.2 * (1 - 0.9 * 0.9)
+    low, high = best["share"]
+    assert low - 1e-12 <= both / EXACT <= high and high - low < 0.1
+    assert main(["faulttree", file, "--most-probable", "1"]) == 0
+    assert "most probable minimal cut sets: 1, " in capsys.readouterr().out
+
+
+def test_a_tree_that_is_too_large_gets_bounds_and_its_best_cut_sets(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = plant(PlantShape(12, 3, 2, 2, 8), 3)
+    exact = analyse(tree).top_probability
+    assert exact is not None
+    path = tmp_path / "plant.xml"
+    path.write_text(write_mef(tree), encoding="utf-8")
+    few = ["faulttree", str(path), "--nodes", "8000", "--seconds", "600"]
+    assert main([*few, "--json", "--cut-sets", "3"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    low, high = found["probability_bounds"]
+    assert low <= exact <= high < 1.2 * low
+    assert found["top_probability"] is None and found["minimal_cut_sets"] is None
+    best = found["most_probable"]
+    assert len(best["cut_sets"]) == best["certain"] == 10 and best["share"][0] > 0.5
+    assert found["incomplete"] is True and found["cut_sets"] == []
+    assert main(few) == 1
+    captured = capsys.readouterr()
+    assert f"probability: between {low:.10g} and " in captured.out
+    assert "most probable minimal cut sets: 10, " in captured.out
+    assert "incomplete: probability and cut sets: more than" in captured.err

@@ -71,6 +71,13 @@ def test_only_the_store_can_be_written(service: Service, folder: Path) -> None:
     assert protection["ReadWritePaths"] == str(folder / "store")
 
 
+def test_only_a_folder_with_ethercat_gets_its_capability(service: Service, folder: Path) -> None:
+    assert "AmbientCapabilities" not in unit_text(service)
+    (folder / "black_box.yaml").write_text("- ethercat: {interfaces: [{interface: eth1}]}\n")
+    unit = sections(unit_text(service_of(load_folder(folder), "amberbox", ME)))
+    assert unit["Service"]["AmbientCapabilities"] == "CAP_NET_RAW"
+
+
 def test_a_ring_elsewhere_can_be_written_if_it_is_there(service: Service) -> None:
     ring = Path("/tmp/ring")
     protection = sections(unit_text(replace(service, ring=ring)))["Service"]

@@ -154,9 +154,7 @@ def _unclear(problem: Problem) -> Iterator[str]:
 def test_a_changed_file_is_accepted_or_refused_with_its_place(
     shipped: Mapping[str, list[Shipped]], kind: str
 ) -> None:
-    @settings(
-        max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow]
-    )
+    @settings(max_examples=examples(30), suppress_health_check=[HealthCheck.too_slow])
     @given(st.data())
     def run(data: st.DataObject) -> None:
         entry = data.draw(st.sampled_from(shipped[kind]))

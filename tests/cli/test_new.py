@@ -19,8 +19,9 @@ def test_the_new_folder_passes_the_check(source: str, tmp_path: Path) -> None:
     built = load_folder(place)
     assert built.robot.id == "my_robot"
     assert [block.plugin for block in built.blocks] == [source]
-    not_there_yet = [n for n in built.notes if n.where in ("recording.path", "status.where")]
-    others = source in ("recording", "status")
+    files = ("recording.path", "status.where", "can.dbc", "can.nodes")
+    not_there_yet = [n for n in built.notes if n.where in files]
+    others = source in ("recording", "status", "can")
     assert built.notes == tuple(not_there_yet) and bool(not_there_yet) == others
     assert main(["check", str(place)]) == 0
 
@@ -69,4 +70,11 @@ def test_unknown_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 def test_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["new", str(tmp_path / "r"), "--from", "ros", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["files"] == ["black_box.yaml", "robot.yaml"]
+    assert json.loads(capsys.readouterr().out)["files"] == [
+        "black_box.yaml", "foxglove-layout.json", "robot.yaml",
+    ]  # fmt: skip
+    layout = json.loads((tmp_path / "r" / "foxglove-layout.json").read_text())
+    plots = [one for name, one in layout["configById"].items() if name.startswith("Plot!")]
+    assert [[line["value"] for line in plot["paths"]] for plot in plots] == [
+        ["/odom.pose.pose.position.x", "/odom.pose.pose.position.y"]
+    ]

@@ -1,4 +1,4 @@
-"""``amberbox plugins``: sources, modes, probes, actions, their missing packages, and all keys."""
+"""``amberbox plugins``: all kinds of plugins, their missing packages, and all keys."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ ALL = sorted(find(SOURCES, defines=("Config", "Source")))
 MODES = sorted(verb.KINDS["mode"].plugins())
 PROBES = sorted(verb.KINDS["probe"].plugins())
 ACTIONS = sorted(verb.KINDS["action"].plugins())
+DETECTORS = sorted(verb.KINDS["detector"].plugins())
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -28,7 +29,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert "ROS 1: topics of a robot" in text
     assert main(["plugins", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in rows] == [*ALL, *MODES, *PROBES, *ACTIONS]
+    assert [row["name"] for row in rows] == [*ALL, *MODES, *PROBES, *ACTIONS, *DETECTORS]
     ros = next(row for row in rows if row["name"] == "ros")
     assert (ros["kind"], ros["missing"]) == ("source", [])
 
@@ -53,7 +54,7 @@ def test_missing_package_is_named(
 def test_every_source_shows_a_sample_that_is_right_and_its_keys(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["plugins", name]) == 0
+    assert main(["plugins", name, "--kind", "source"]) == 0
     text = capsys.readouterr().out
     module = get(SOURCES, name).load()
     assert module.SAMPLE.rstrip() in text
@@ -134,3 +135,13 @@ def test_describe_reaches_nested_keys() -> None:
     assert rows["change.heartbeat_s"].default == "5"
     assert rows["keep"].type == "one of all, bulk, ring, incident, none"
     assert rows["change.bands"].type == "a mapping to a number"
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_every_detector_shows_its_keys(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins", name, "--kind", "detector"]) == 0
+    text = capsys.readouterr().out
+    module = verb.KINDS["detector"].plugins()[name].load()
+    assert getattr(module, "SAMPLE", "").rstrip() in text
+    for row in describe(module.Config):
+        assert f"  {row.key} " in text

@@ -115,12 +115,7 @@ def rows(folder: Path) -> int:
 def test_inputs_that_end_end_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = SIM.replace("seed: 1", "seed: 1\n    speed: max\n    duration_s: 5")
     (folder / "black_box.yaml").write_text(text)
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        assert main(["record", str(folder)]) == 0
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    assert main(["record", str(folder)]) == 0
     assert f"recorded 255 messages of 2 items in {folder / 'store'}" in capsys.readouterr().err
 
 
@@ -136,12 +131,7 @@ def test_a_robot_that_was_off_is_no_failure_of_a_service(
     if service:
         monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "gone"))
     (folder / "black_box.yaml").write_text("- zmq: {endpoint: tcp://127.0.0.1:1}\n")
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        assert main(["record", str(folder), "--for", "0.3", "--quiet"]) == status
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    assert main(["record", str(folder), "--for", "0.3", "--quiet"]) == status
     assert "warning: nothing was heard" in capsys.readouterr().err
     assert main(["record", "--help"]) == 0
     assert "1 nothing was heard" in " ".join(capsys.readouterr().out.split())

@@ -151,3 +151,46 @@ def test_a_folder_that_cannot_be_recorded_is_refused_at_the_start(
 def test_a_file_is_no_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(folder / "black_box.yaml")]) == 2
     assert "is no folder" in capsys.readouterr().err
+
+
+BATTERY = """\
+- sim:
+    {{seed: 3, speed: {speed}, duration_s: {seconds}, topics: [{{name: battery}}, {{name: odom}}],
+     faults: [{faults}]}}
+"""
+
+
+def test_detectors_run_beside_the_watcher_which_records_their_findings(
+    folder: Path, boxes: list[Box], capsys: pytest.CaptureFixture[str]
+) -> None:
+    nominal, model = folder.parent / "nominal", folder.parent / "battery.model"
+    nominal.mkdir()
+    (nominal / "robot.yaml").write_text("id: n\n")
+    (nominal / "black_box.yaml").write_text(BATTERY.format(speed="max", seconds=60, faults=""))
+    assert main(["record", str(nominal), "--quiet"]) == 0
+    with (folder / "robot.yaml").open("a") as file:
+        file.write("detection: {model: ../battery.model}\n")
+    fault = "{id: battery_overheats, at_s: 1, magnitude: 1}"
+    (folder / "black_box.yaml").write_text(BATTERY.format(speed=1, seconds=3600, faults=fault))
+    assert main(["check", str(folder)]) == 0
+    assert "no detector runs until it is right" in capsys.readouterr().out
+    assert main(["learn", str(nominal), "-o", str(model), "--detectors", "guard"]) == 0
+    assert main(["check", str(folder)]) == 0
+    assert "no detector" not in capsys.readouterr().out
+    box = Box(folder)
+    boxes.append(box)
+    box.wait_for("detect")
+    found = "guard.range.sim_battery.temperature: present"
+    wait_until(lambda: any(text.startswith(found) for text in events(folder, "finding")))
+    names = ("record", "watch", "detect")
+    before = [box.child(name)["pid"] for name in names]
+    model.write_bytes(b"half of a model")
+    wait_until(lambda: events(folder, "detect_model_refused"), "a damaged file is refused")
+    options = folder.parent / "options.yaml"
+    options.write_text("guard: {items: 1}\n")
+    words = ["--detectors", "guard", "--options", str(options)]
+    assert main(["learn", str(nominal), "-o", str(model), *words]) == 0
+    wait_until(lambda: events(folder, "detect_anew"), "the new model is in use")
+    assert [box.child(name)["pid"] for name in names] == before  # nothing was started again
+    box.process.terminate()
+    assert box.process.wait(PATIENCE_S) == 0

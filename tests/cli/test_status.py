@@ -160,7 +160,7 @@ def test_one_component_in_full(
     assert capsys.readouterr().out.splitlines()[3:] == [
         "",
         "needs: laser (error)",
-        "recovery actions (not carried out): restart",
+        "recovery actions: restart",
     ]
 
 

@@ -17,7 +17,7 @@ import pytest
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.blackbox.store.store import Store, WriterLock, create_store, open_store
 from amberbox.cli.main import main
-from amberbox.consult.folder_knowledge import load_diagnoser
+from amberbox.consult.context import load_diagnoser
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.engine import Engine
 from amberbox.monitoring.plan import MonitoringPlan

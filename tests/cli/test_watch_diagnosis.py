@@ -11,7 +11,7 @@ import pytest
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
-from amberbox.consult.folder_knowledge import load_diagnoser
+from amberbox.consult.context import load_diagnoser
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.fmea.loader import read_fmea
 from amberbox.diagnosis.knowledge import Knowledge

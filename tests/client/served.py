@@ -16,6 +16,8 @@ from amberbox.monitoring.findings import encoded
 from amberbox.server.accounts.tokens import add_token
 from amberbox.server.accounts.users import find_user
 from amberbox.server.schema import STATUS
+from tests.cli.test_consistency import POWER
+from tests.cli.test_structure import WHEEL
 from tests.server.archive.recordings import Robot
 from tests.server.data.filled import fill
 from tests.server.house import House, house
@@ -87,7 +89,8 @@ def _token(home: House, owner: str, *scopes: str) -> str:
 def _say(home: House) -> None:
     """Let the robot's watcher have found a laser without scans, and the server have an alarm."""
     at_ns = sim.AT_NS
-    sim.hand_in(home)
+    more = {"models/wheel.yaml": WHEEL.encode(), "models/power.yaml": POWER.encode()}
+    sim.hand_in(home, more=more)
     sim.state(home)
     silent = sim.symptom(sim.NO_SCANS, at_ns)
     sim.say(home, [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import zipfile
 from pathlib import Path
 
@@ -24,6 +26,7 @@ from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.core.tls import PinError
 from amberbox.server.archive.gaps import TO_COME
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import T0_NS
 from tests.client.served import Served
 from tests.server.data.filled import FORMULAS, ROWS
@@ -147,6 +150,9 @@ def test_what_is_broken_and_what_can_be(fleet: Fleet) -> None:
     assert ranked["answers"] == {"laser_front.lamp": "no"}
     assert fleet.fmea(ROBOT)["table"]
     assert fleet.faulttrees(ROBOT)["effects"]
+    assert {"power", "wheel"} <= {model.name for model in fleet.model_files(ROBOT)}
+    assert fleet.structure(ROBOT, "wheel", show="mso")["count"] == 4
+    assert fleet.consistency(ROBOT, "power", ["b1.in=off"])["diagnoses"] == [[]]
     found = fleet.rules(ROBOT, "status(C, ok, From, To)", from_=sim.AT_NS - 10**11)
     assert found["answers"][0]["C"] == "laser_front" and found["proof"]
 
@@ -188,6 +194,29 @@ def test_a_connection_that_the_server_closed_is_made_anew(fleet: Fleet) -> None:
     assert kept is not None and kept.sock is not None
     kept.sock.close()
     assert fleet.robots()
+
+
+def test_nothing_is_sent_on_a_connection_that_the_server_has_ended() -> None:
+    """A request that changes something is never repeated, so it must not go there at first."""
+
+    def answer_once_each() -> None:
+        for _ in range(2):
+            connection, _address = listener.accept()
+            with connection:
+                connection.recv(65536)
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}")
+            ended.set()
+
+    ended = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = threading.Thread(target=answer_once_each)
+        server.start()
+        wire = ApiConnection(f"http://127.0.0.1:{listener.getsockname()[1]}")
+        assert wire.send("POST", "/a").body == b"{}"
+        assert ended.wait(PATIENCE_S)
+        assert wire.send("POST", "/b").body == b"{}"
+        server.join(PATIENCE_S)
+        wire.close()
 
 
 def test_each_trouble_is_a_line(server: Served) -> None:

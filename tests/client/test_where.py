@@ -18,7 +18,10 @@ from amberbox.client.fleet import Fleet
 from amberbox.client.models import Card
 from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.core.types import Gap
+from amberbox.server.accounts import permissions
 from amberbox.testing.records import T0_NS
+from tests.cli.test_consistency import POWER
+from tests.cli.test_structure import WHEEL
 from tests.client.served import Served
 from tests.server.house import PASSWORD
 from tests.support.processes import free_port
@@ -190,13 +193,31 @@ def test_what_is_known_of_faults(technician: Served, capsys: Capture) -> None:
     assert "on this computer" in refused(capsys, "fmea", "check", technician.where)
     trees = said(capsys, "faulttree", technician.where)
     effect = trees.splitlines()[2].split()[0]
-    one = said(capsys, "faulttree", technician.where, "--effect", effect, "--cut-sets", "2")
-    assert "minimal cut sets" in one and "{" in one
+    one = said(capsys, "faulttree", technician.where, "--effect", effect, "--cut-sets", "2",
+               "--most-probable", "1")  # fmt: skip
+    assert "most probable minimal cut sets: 1, " in one and "{" in one
     assert "missing" in said(capsys, "faulttree", technician.where, "--closest")
     words = ("--ask", "status(C, ok, F, T)", "--from", "2027-01-01", "--why")
     answers = said(capsys, "rules", "--where", technician.where, *words)
     assert answers.startswith("C = laser_front") and "watcher" in answers
     assert "a goal" in refused(capsys, "rules", "--where", technician.where)
+
+
+def test_models_answer_as_on_the_robot(technician: Served, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "wheel.yaml").write_text(WHEEL)
+    (tmp_path / "power.yaml").write_text(POWER)
+    archive = str(technician.data)
+    for verb, name, words in (
+        ("structure", "wheel", []),
+        ("structure", "wheel", ["--mso"]),
+        ("structure", "wheel", ["--sensors", "--measurable", "torque", "speed"]),
+        ("consistency", "power", ["--observe", "b1.out=on", "--minimal", "rank"]),
+    ):
+        here = said(capsys, verb, str(tmp_path / f"{name}.yaml"), *words)
+        assert said(capsys, verb, technician.where, name, *words) == here
+        assert said(capsys, verb, archive, name, *words) == here
+    assert "its own" in refused(capsys, "structure", technician.where, "wheel", "--seconds", "1")
+    assert "did you mean 'wheel'?" in refused(capsys, "structure", technician.where, "wheels")
 
 
 def test_alarms_are_the_servers(technician: Served, capsys: Capture) -> None:
@@ -290,6 +311,17 @@ def test_a_name_and_a_password_make_a_token_for_this_computer(
     assert "odom" in said(capsys, "items", f"{server.url}/robots/ropod_001")
     monkeypatch.setattr("sys.stdin", io.StringIO(PASSWORD + "\n"))
     refused(capsys, "sign-in", address, "--user", "viewer")  # viewers make no tokens
+
+
+def test_a_server_without_commands_gives_a_token_for_the_rest(
+    server: Served, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = {**permissions.SCOPES, "fly:commands": "what this server does not know"}
+    monkeypatch.setattr(permissions, "SCOPES", later)
+    monkeypatch.setattr("sys.stdin", io.StringIO(PASSWORD + "\n"))
+    address = f"{server.url}#ca=sha256:{server.pin}"
+    assert "signed in" in said(capsys, "sign-in", address, "--user", "technician")
+    assert "odom" in said(capsys, "items", f"{server.url}/robots/ropod_001")
 
 
 def test_a_strange_authority_and_a_wrong_token_are_not_kept(

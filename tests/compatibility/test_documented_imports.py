@@ -18,7 +18,7 @@ DOTTED = re.compile(r"\bamberbox(?:\.[a-z_]\w*)+(?:\.[A-Z]\w*)?")
 STATEMENT = re.compile(r"from (amberbox[\w.]*) import (\([^)]*\)|[^\n]*)")
 NO_MODULE = {
     "amberbox.service", "amberbox.org", "amberbox.table", "amberbox.yaml", "amberbox.broken",
-    "amberbox.actions",
+    "amberbox.actions", "amberbox.sources",
 }  # fmt: skip
 """Words of the documentation that look like a module: a unit, metadata of a file, a folder, a
 group of entry points."""

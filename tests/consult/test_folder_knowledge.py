@@ -94,3 +94,51 @@ def test_faults_spread_by_what_component_files_say(
     assert fmea is not None, problems
     gone = lost(fmea, [f"{name}#dead" for name in down])
     assert gone == {*down, *(("navigation", "drive") if is_lost else ())}
+
+
+MODES = {
+    "tilt": ("range", "ros_imu.linear_acceleration_z", "in_range", "bool", "{min: 9, max: 11}"),
+    "jerk": ("rate_of_change", "ros_imu.linear_acceleration_z", "in_limits", "bool", "{max: 5}"),
+    "turn": ("rate_of_change", "ros_imu.angular_velocity_z", "rate", "float", "{max: 5}"),
+    "heartbeat": ("heartbeat", "ros_imu", "alive", "bool", "{rate: 10}"),
+}
+"""Monitor, input, result, type of the output and arguments, by mode."""
+
+
+@pytest.mark.parametrize(
+    ("symptom", "unit", "what"),
+    [
+        ("imu/tilt/in_range", "m/s2", ""),
+        ("imu/tilt/in_range", "g", "ros_imu.linear_acceleration_z is in m/s^2, not in g"),
+        ("imu/jerk/in_limits", "m/s^2/s", ""),
+        ("imu/jerk/in_limits", "m/s^2", "rate(ros_imu.linear_acceleration_z) is in m/s^2/s"),
+        ("imu/turn/rate", "rad/s^2", ""),
+        ("imu/turn/rate", "rad/s", "imu/turn/rate is in rad/s^2, not in rad/s"),
+        ("imu/heartbeat/alive", "s", ""),
+        ("imu/heartbeat/alive", "ms", "age(ros_imu) is in s, not in ms"),
+    ],
+)
+def test_a_monitor_knows_the_unit_of_its_measure(
+    tmp_path: Path, symptom: str, unit: str, what: str
+) -> None:
+    (tmp_path / "robot.yaml").write_text("id: r1\n")
+    block = "- ros: {topics: [{name: /imu, type: sensor_msgs/Imu}]}\n"
+    (tmp_path / "black_box.yaml").write_text(block)
+    (tmp_path / "components").mkdir()
+    names = ", ".join(f"imu/{name}.yaml" for name in MODES)
+    (tmp_path / "components" / "imu.yaml").write_text(f"component_name: imu\nmodes: [{names}]\n")
+    (tmp_path / "components" / "imu").mkdir()
+    for name, (monitor, text, result, kind, arguments) in MODES.items():
+        expected = "true" if kind == "bool" else "1"
+        (tmp_path / "components" / "imu" / f"{name}.yaml").write_text(
+            f"name: {name}\nmonitor: {monitor}\nmappings: [{{mapping: {{inputs: [{text}], outputs: "
+            f"[{{output: {{name: {result}, type: {kind}, expected: {expected}}}}}]}}}}]\n"
+            f"arguments: {arguments}\n"
+        )
+    (tmp_path / "fmea.yaml").write_text(
+        f"symptoms: {{{symptom}: {{edges: [1], unit: {unit}}}}}\n"
+        f"types: {{imu: {{failure_modes: {{bad: {{rate: 1e-5, symptoms: [{symptom}]}}}}}}}}\n"
+    )
+    _, problems = load_fmea(tmp_path / "fmea.yaml", fmea_references(load_folder(tmp_path)))
+    errors = [problem.what for problem in problems if problem.is_error]
+    assert [what in error for error in errors] == ([True] if what else []), errors

@@ -46,6 +46,14 @@ def test_an_edge_is_where_a_condition_becomes_true() -> None:
     assert edges(watched, 10) == []
 
 
+def test_each_of_several_rows_with_the_same_time_counts() -> None:
+    watched = watch(high="b.v > 2")
+    watched.add(batch("b", [1, 1, 1, 2], v=np.array([1.0, 3.0, 1.0, 1.0])))
+    assert edges(watched, 1) == []
+    watched.add(batch("b", [2, 2], v=np.array([3.0, 1.0])))
+    assert [edge.at_ns for edge in watched.edges(9 * NS)] == [NS + 1, 2 * NS + 1]
+
+
 def test_the_first_value_heard_is_an_edge_if_it_is_true() -> None:
     watched = watch(started="task.state == 'STARTED'")
     assert edges(watched, 1) == []

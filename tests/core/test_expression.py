@@ -144,6 +144,7 @@ def test_division_follows_ieee_754() -> None:
         ("not " * 60 + "x", 201, "nested too deeply"),
         ("- " * 60 + "x", 101, "nested too deeply"),
         ("x" * 10_001, 1, "longer than"),
+        (" + ".join(["x"] * 201), 1, "more than 200 terms in a row"),
     ],
 )
 def test_error_points_at_the_place(text: str, column: int, what: str) -> None:
@@ -191,6 +192,14 @@ def test_addresses_and_history() -> None:
     assert expression.needs_history
     assert not parse("a.x > 1").needs_history
     assert parse("age(a)").needs_history
+
+
+def test_the_longest_sum_works_everywhere() -> None:
+    long = parse(" + ".join(["x"] * 200))
+    assert long.addresses() == ("x",)
+    assert long.evaluate({"x": 2}) == 400
+    assert [*long.evaluate_columns(np.array([1, 2]), {"x": np.array([2.0, 4.0])})] == [400, 800]
+    assert hash(long.resolve(["a.x"])) == hash(long.resolve(["a.x"]))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amberbox.core.expression import Expression, ExpressionError, parse
+from amberbox.core.expressions.evaluation import WindowCache
 from amberbox.core.samples import Samples
 
 EDGES = (0.0, -0.0, 1.0, -2.5, 7.0, float("inf"), float("-inf"), float("nan"), 1e308, 5e-324, 0.1)
@@ -105,7 +106,7 @@ def among_many(expression: Expression, samples: dict[str, Samples], at_ns: int) 
     return value.item() if isinstance(value, np.generic) else value
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(numbers | conditions, recordings(), st.integers(-2, 14))
 def test_one_instant_is_the_same_among_many(
     text: str, samples: dict[str, Samples], at_ns: int
@@ -122,13 +123,13 @@ def test_one_instant_is_the_same_among_many(
     assert bits(float(expression.numbers(samples, np.array([at_ns]))[0])) == bits(float(number))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(numbers | conditions, numbers | conditions, recordings(), st.integers(-2, 14))
 def test_what_expressions_share_changes_nothing(
     first: str, text: str, samples: dict[str, Samples], at_ns: int
 ) -> None:
     for at in (at_ns, np.array([at_ns - 1, at_ns, at_ns + 2])):
-        windows: dict[str, Any] = {}
+        windows = WindowCache()
         parse(f"{first} == {first}").numbers(samples, at, windows)
         shared = np.atleast_1d(parse(text).numbers(samples, at, windows))
         alone = np.atleast_1d(parse(text).numbers(samples, at))
@@ -138,15 +139,15 @@ def test_what_expressions_share_changes_nothing(
 def test_equal_windows_are_worked_out_once() -> None:
     samples = {"f.x": Samples()}
     samples["f.x"].extend(np.array([1, 2, 3]), np.array([1.0, 2.0, 6.0]))
-    windows: dict[str, Any] = {}
+    windows = WindowCache()
     there = parse("mean(f.x over 9ns) < 4 and  mean(f.x  over 9ns) > 2")
     assert there.numbers(samples, 3, windows) == 1
-    assert list(windows.values()) == [3.0]
+    assert list(windows.results.values()) == [3.0]
     assert parse("mean(f.x over 2ns)").numbers(samples, 3, windows) == 4
-    assert len(windows) == 2
+    assert len(windows.results) == 2
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     numbers | conditions, st.fixed_dictionaries({n: v | st.none() for n, (_, v) in TYPES.items()})
 )

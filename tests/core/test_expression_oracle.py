@@ -193,7 +193,7 @@ def unmasked(column: Any) -> list[Any]:
     ]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     part=st.one_of(numbers, conditions),
     rows=st.lists(st.tuples(values, values, values), max_size=6),
@@ -211,7 +211,7 @@ def test_columns_and_scalars_agree(part: Part, rows: list[tuple[Any, Any, Any]])
         assert same(by_column[i], wanted)
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=250)
 @given(part=st.one_of(timed, conditions, numbers), samples=recordings)
 def test_series_agree_with_the_plain_reading(part: Part, samples: Samples) -> None:
     expression = parse(part.text)
@@ -224,7 +224,7 @@ def test_series_agree_with_the_plain_reading(part: Part, samples: Samples) -> No
     assert same(expression.evaluate_series(series, 11), part.meaning(samples, 11))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(part=timed, samples=recordings, t=st.integers(0, 25))
 def test_history_says_how_much_of_the_past_is_enough(part: Part, samples: Samples, t: int) -> None:
     expression = parse(part.text)
@@ -239,7 +239,7 @@ def test_history_says_how_much_of_the_past_is_enough(part: Part, samples: Sample
     assert same(expression.evaluate_series(columns_of(short), t), whole)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     st.text(alphabet="ab.x/#:`'\"()[]<>=!+-*%,0159 \nfor over and not mean( 5s nul", max_size=40)
 )

@@ -37,7 +37,7 @@ def _frames(boxes: Sequence[LayoutBox], layout: GraphLayout) -> dict[str, Frame]
     return {box.id: Frame(*layout.corners[box.id], box.width, box.height) for box in boxes}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(graphs(), some.booleans())
 def test_boxes_do_not_overlap(graph: tuple[list[LayoutBox], Links], down: bool) -> None:
     """Give every box room of its own, inside the drawing."""
@@ -51,7 +51,7 @@ def test_boxes_do_not_overlap(graph: tuple[list[LayoutBox], Links], down: bool) 
     assert max(frame.y + frame.height for frame in frames) <= layout.height + 0.01
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(graphs(), some.booleans())
 def test_lines_cross_no_box(graph: tuple[list[LayoutBox], Links], down: bool) -> None:
     """Lead lines around the boxes, from the edge of one to the edge of the other."""
@@ -64,7 +64,7 @@ def test_lines_cross_no_box(graph: tuple[list[LayoutBox], Links], down: bool) ->
         assert not [1 for f in frames.values() for point in points if f.holds(*point)]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(graphs())
 def test_lines_begin_and_end_at_their_boxes(graph: tuple[list[LayoutBox], Links]) -> None:
     """Join the two boxes of a link; the arrow points at the second one."""
@@ -84,7 +84,7 @@ def _touches(frame: Frame, point: tuple[float, float]) -> bool:
     return level and min(abs(x - frame.x), abs(x - frame.x - frame.width)) < 0.1
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(graphs())
 def test_same_graph_same_layout(graph: tuple[list[LayoutBox], Links]) -> None:
     """Draw the same thing the same way."""

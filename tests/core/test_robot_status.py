@@ -83,7 +83,7 @@ def test_the_reason_is_of_what_makes_it_as_it_is() -> None:
 
 @fuzz
 @given(SEEN, SEEN)
-@settings(max_examples=examples(200), deadline=None)
+@settings(max_examples=examples(200))
 def test_level_severity_order_and_sentence_agree(one: Observed, other: Observed) -> None:
     said, also = judge(one), judge(other)
     assert (said.level == "ok") == (said.text == NOTHING_WRONG) == (said.rank == 0)

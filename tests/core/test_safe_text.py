@@ -37,7 +37,7 @@ def test_one_line_is_one_line() -> None:
 
 
 @fuzz
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(st.text())
 def test_nothing_hidden_is_left_and_json_means_the_same(text: str) -> None:
     shown = escape_hidden(text)

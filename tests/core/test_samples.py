@@ -78,7 +78,7 @@ def whole(column: tuple[IntArray, Any]) -> Samples:
     return samples
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(columns(), instants)
 def test_many_instants_give_what_each_gives(column: tuple[IntArray, Any], now: IntArray) -> None:
     samples = whole(column)
@@ -88,7 +88,7 @@ def test_many_instants_give_what_each_gives(column: tuple[IntArray, Any], now: I
             assert together == [bits(ask(samples, int(n))) for n in now], name
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(columns(), instants, cuts)
 def test_parts_and_forgetting_change_nothing(
     column: tuple[IntArray, Any], now: IntArray, places: set[int]
@@ -108,7 +108,7 @@ def test_parts_and_forgetting_change_nothing(
                     assert bits(ask(samples, instant)) == bits(ask(reference, instant)), name
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(columns(), st.integers(0, 450))
 def test_the_answers_are_those_of_the_definition(column: tuple[IntArray, Any], at: int) -> None:
     samples, now = whole(column), at * MS
@@ -212,7 +212,7 @@ def count_at(samples: Samples, times: Sequence[int]) -> None:
     samples.extend(np.array(times, np.int64) * MS, np.arange(1, len(times) + 1))
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(*[st.lists(st.integers(0, 400), max_size=12).map(sorted)] * 3, instants)
 def test_how_an_item_flows(
     heard: list[int], rows: list[int], gaps: list[int], now: IntArray

@@ -31,6 +31,7 @@ class Pretended:
     robots: Sequence[str] = tuple(ROBOTS)
     faults: Sequence[str] = (FAULT,)
     acting: dict[str, str] = field(default_factory=dict)
+    codes_shown: dict[str, str] = field(default_factory=dict)
 
     def broken(self) -> Mapping[str, str]:
         return self.acting
@@ -42,6 +43,13 @@ class Pretended:
 
     def repair(self, robot: str) -> None:
         self.acting.pop(robot, None)
+
+    def codes_at_robots(self) -> Mapping[str, str]:
+        return self.codes_shown
+
+    def confirm(self, robot: str) -> None:
+        if self.codes_shown.pop(robot, None) is None:
+            raise UsageError("no motion waits for its confirmation")
 
     def end(self) -> None:
         self.acting.clear()
@@ -121,7 +129,7 @@ def test_a_robot_is_broken_and_repaired(home: House, demo: Pretended) -> None:
     path = "/api/v1/demo/ropod_002/fault"
     assert viewer.get("/api/v1/demo").json()["faults"] == [FAULT]
     broken = viewer.post(path, json={"fault": FAULT}).json()["robots"]
-    assert {"robot": "ropod_002", "fault": FAULT} in broken
+    assert {"robot": "ropod_002", "fault": FAULT, "code": ""} in broken
     assert demo.acting == {"ropod_002": FAULT}
     assert viewer.post(path, json={"fault": "unheard_of"}).status_code == 400
     assert viewer.delete(path).status_code == 200
@@ -130,6 +138,19 @@ def test_a_robot_is_broken_and_repaired(home: House, demo: Pretended) -> None:
     assert [(row["action"], row["details"]) for row in rows[:2]] == [
         ("demo.repair", {"fault": FAULT}), ("demo.break", {"fault": FAULT}),
     ]  # fmt: skip
+
+
+def test_a_motion_is_confirmed_at_the_robot_by_operators(home: House, demo: Pretended) -> None:
+    demo.codes_shown["ropod_002"] = "123456"
+    path = "/api/v1/demo/ropod_002/confirm"
+    viewer, operator = home.client("viewer"), home.client("operator")
+    codes = {one["robot"]: one["code"] for one in viewer.get("/api/v1/demo").json()["robots"]}
+    assert codes == {robot: "123456" if robot == "ropod_002" else "" for robot in codes}
+    assert viewer.post(path).status_code == 403
+    assert [one["code"] for one in operator.post(path).json()["robots"]] == [""] * len(codes)
+    assert "no motion waits" in operator.post(path).json()["error"]["what"]
+    assert "data-confirm-motion" in operator.get("/robots/ropod_002").text
+    assert "data-confirm-motion" not in viewer.get("/robots/ropod_002").text
 
 
 def test_nobody_breaks_robots_that_are_not_theirs(home: House, demo: Pretended) -> None:
@@ -158,6 +179,7 @@ def test_elsewhere_there_is_nothing_of_it(home: House) -> None:
     path = "/api/v1/demo/ropod_001/fault"
     assert admin.post(path, json={"fault": FAULT}).status_code == 404
     assert admin.delete(path).status_code == 404
+    assert admin.post("/api/v1/demo/ropod_001/confirm").status_code == 404
     assert "demo-bar" not in admin.get("/").text
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import signal
 import socket
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import amberbox
+from amberbox.agent.command_trust import read_trust, trust_path
 from amberbox.blackbox.query import mission_search
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.blackbox.robot_folder.robot_yaml import read_rules
@@ -74,8 +76,16 @@ async def _answers(port: int) -> bool:
 def test_the_robots_folders_are_right_and_report_to_the_server(tmp_path: Path) -> None:
     stage = LiveDemo(tmp_path, 18999)
     stage.prepare()
+    assert len({stage.paths(robot).commands for robot in IDS}) == len(IDS)
     for robot in IDS:
-        folder = load_folder(tmp_path / robot)
+        place = stage.paths(robot)
+        assert main(["check", str(place.folder)]) == 0
+        assert place.commands in (place.folder / "actions" / "sim.yaml").read_text()
+        folder = load_folder(place.folder)
+        named = trust_path(folder)
+        assert named is not None and not named.is_relative_to(place.folder)
+        people = read_trust(named).people
+        assert people["technician"].key == json.loads(place.key.read_text())["public"]
         assert folder.robot.id == robot
         assert folder.robot.server is not None
         assert folder.robot.server.url.startswith("http://127.0.0.1:")

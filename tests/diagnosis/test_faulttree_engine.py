@@ -11,6 +11,7 @@ from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis, Symptom, SymptomState
 from amberbox.diagnosis.covering.observations import predict
 from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer
+from amberbox.diagnosis.evidence import faulttree
 from amberbox.diagnosis.evidence.faulttree import conclude
 from amberbox.diagnosis.knowledge import Knowledge
 from tests.diagnosis.fmea.small import small
@@ -156,3 +157,16 @@ def test_ratios_are_those_of_covering_where_it_has_the_same_sets(
     for one, two in itertools.pairwise(shared):
         odds = other[one].probability / other[two].probability
         assert mine[one].probability / mine[two].probability == pytest.approx(odds, rel=0.1)
+
+
+def test_of_a_tree_too_large_to_be_solved_the_most_probable_sets_are_listed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    exact = of(seen(GIVEN_UP))
+    monkeypatch.setattr(faulttree, "_NODES", 8)
+    found = of(seen(GIVEN_UP))
+    assert found.incomplete.startswith("probability and cut sets: more than")
+    assert [h.faults for h in found.hypotheses] == [h.faults for h in exact.hypotheses]
+    for mine, other in zip(found.hypotheses, exact.hypotheses, strict=True):
+        assert mine.probability == pytest.approx(other.probability)
+    assert 0.0 < found.mass_covered <= 1.0

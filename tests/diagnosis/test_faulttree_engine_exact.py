@@ -78,7 +78,7 @@ def smallest(fmea: Fmea, to_explain: set[str]) -> list[frozenset[str]]:
     return found
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(with_symptoms(), st.lists(st.sampled_from(STATES), min_size=4, max_size=4))
 def test_it_lists_the_smallest_sets_that_explain_all(fmea: Fmea, drawn: list[SymptomState]) -> None:
     states = dict(zip(SYMPTOMS, drawn, strict=True))

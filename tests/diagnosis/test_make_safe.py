@@ -107,7 +107,7 @@ TESTS = st.lists(st.integers(0, 200), max_size=3, unique=True)
 
 @fuzz
 @given(SETS, SHARES, TESTS)
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 def test_the_order_is_safe_for_any_posterior(
     sets: list[frozenset[int]], shares: list[float], tests: list[int]
 ) -> None:

@@ -220,6 +220,20 @@ def test_the_announcement_has_limits_and_no_addresses(tmp_path: Path) -> None:
     assert speak["parameters"]["text"]["max_length"] == 20
 
 
+def test_of_too_many_actions_as_many_are_announced_as_fit(tmp_path: Path) -> None:
+    texts = [TEXT.replace("speak", f"speak_{n:03d}") for n in range(100)]
+    place = folder_of(tmp_path, "".join(texts))
+    assert "left_out" not in announcement(place)
+    for most in (10_000, 10_300, 10_600):
+        text = announcement(place, most_bytes=most)
+        found = json.loads(text)
+        assert most - 700 < len(text.encode()) <= most
+        assert found["left_out"] == 100 - len(found["actions"]) and str(most) in found["reason"]
+    assert json.loads(announcement(place, most_bytes=250)) == {
+        "actions": [], "left_out": 100, "reason": "an announcement has at most 250 bytes"
+    }  # fmt: skip
+
+
 def test_values_are_checked_and_defaults_filled_in(drive: DeclaredAction) -> None:
     values = check_parameters(drive, '{"times": 3.0, "distance_m": -2, "slow": true}')
     assert values == {

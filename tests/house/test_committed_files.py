@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from tools.check_files import LARGEST_BYTES, check
-from tools.findings import ROOT
 
 
 def repository(folder: Path, text: str) -> Path:
@@ -59,7 +58,3 @@ def test_an_ignored_file_does_not_count(tmp_path: Path) -> None:
     (tmp_path / ".gitignore").write_text("mine\n")
     (tmp_path / "mine").write_text(f"{HOME}/x/")
     assert check(tmp_path) == []
-
-
-def test_the_project_is_clean() -> None:
-    assert check(ROOT) == []

@@ -20,11 +20,22 @@ from tools.findings import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
-CONSTRAINTS = ["all", "test"]
+CONSTRAINTS = ["all", "test", "bench"]
 SERVER = ["argon2", "deltalake", "fastapi", "sqlalchemy", "starlette", "uvicorn", "websockets"]
 """What only the server has installed, and of these the link ``websockets``."""
 OPTIONAL = ["pyarrow", "duckdb", "tsdownsample", "matplotlib", "zmq", "msgpack", "pandas"]
-OPTIONAL += ["polars", "mcap", "mcap_ros1_support", "foxglove"]
+OPTIONAL += [
+    "polars",
+    "mcap",
+    "mcap_ros1_support",
+    "foxglove",
+    "pytest",
+    "zenoh",
+    "cyclonedds",
+    "PIL",
+]
+IN_PYTEST = ("amberbox.testing", "amberbox.experiments.pytest_plugin", "amberbox.sim.folder.tests")
+"""What only pytest imports."""
 
 
 def pins(file: str) -> dict[str, tuple[str, int]]:
@@ -32,7 +43,7 @@ def pins(file: str) -> dict[str, tuple[str, int]]:
     text = (ROOT / "constraints" / f"{file}.txt").read_text().replace("\\\n", " ")
     found: dict[str, tuple[str, int]] = {}
     for line in text.splitlines():
-        package, *hashes = line.split()
+        package, *hashes = line.replace(' ; platform_machine == "x86_64"', "").split()
         name, _, version = package.partition("==")
         assert version and re.fullmatch(r"[\w.-]+", name), line
         assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", one) for one in hashes), line
@@ -62,9 +73,9 @@ def test_tests_run_with_the_versions_that_users_get() -> None:
     assert {package: everything[package] for package in pins("all")} == pins("all")
 
 
-def test_all_names_every_extra_but_the_test_one() -> None:
+def test_all_names_every_extra_but_those_of_our_own_work() -> None:
     (own,) = map(Requirement, EXTRAS["all"])
-    assert own.extras == set(EXTRAS) - {"all", "test"}
+    assert own.extras == set(EXTRAS) - {"all", "test", "bench"}
 
 
 def test_what_we_import_is_what_we_declare() -> None:
@@ -88,7 +99,7 @@ def test_what_we_import_is_what_we_declare() -> None:
         for entry in imports(module, path, known)
         if _distribution(entry.target)
         not in (sometimes if entry.lazy else own.get(f"{module}.".split(".")[1], always)) | {None}
-        and not module.startswith("amberbox.testing")
+        and not module.startswith(IN_PYTEST)
     }
     assert undeclared == set()
 
@@ -132,8 +143,8 @@ import amberbox
 for name in {SERVER}:
     sys.modules[name] = None
 for info in pkgutil.walk_packages(amberbox.__path__, "amberbox."):
-    servers = info.name.startswith(("amberbox.server.", "amberbox.demo."))
-    if not servers and not info.name.endswith("__main__"):
+    others = info.name.startswith(("amberbox.server.", "amberbox.demo.", {IN_PYTEST[1]!r}))
+    if not others and not info.name.endswith("__main__"):
         importlib.import_module(info.name)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -150,10 +161,22 @@ def _distribution(module: str) -> str | None:
     top = module.partition(".")[0]
     if top in sys.stdlib_module_names or top == "amberbox":
         return None
-    brought = {"yaml": "pyyaml", "zmq": "pyzmq", "bson": "pymongo", "foxglove": "foxglove-sdk"}
-    brought["argon2"] = "argon2-cffi"
+    brought = {
+        "yaml": "pyyaml",
+        "zmq": "pyzmq",
+        "paho": "paho-mqtt",
+        "bson": "pymongo",
+        "PIL": "pillow",
+        "foxglove": "foxglove-sdk",
+        "argon2": "argon2-cffi",
+        "zenoh": "eclipse-zenoh",
+        "can": "python-can",
+        "serial": "pyserial",
+    }
     return brought.get(top, canonicalize_name(top))
 
 
 def _extras(name: str) -> list[str]:
-    return [extra for extra in EXTRAS if extra != "test" or name == "test"]
+    """Return the extras of a constraints file."""
+    own = {"test", "bench"}
+    return ["bench"] if name == "bench" else [one for one in EXTRAS if one not in own - {name}]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from amberbox.blackbox.journal import channels
+from amberbox.link import limits
 from amberbox.link.frames import (
     START,
     Ack,
@@ -36,7 +37,7 @@ from amberbox.link.robot_end import LANES, OutOfStepError, RobotEnd
 from amberbox.link.server_end import AdmitRobot, SendFrames, ServerEnd, StoreRows
 from tests.link.memory_ledger import MemoryLedger
 
-WRITERS = ("watch", "keep")
+WRITERS = ("watch", "keep", "act")
 
 
 class Ledger(Protocol):
@@ -116,7 +117,7 @@ class Robot:
             writer = self.chance.choice(WRITERS)
             run = self.disk.runs[writer][self.live[writer]]
             self.written += 1
-            channel = self.chance.choice([channels.STATUS, channels.ALARM, ""])
+            channel = self.chance.choice([channels.STATUS, channels.ALARM, channels.COMMAND, ""])
             data = b"%d of %s" % (self.written, self.boot.encode())
             place = self.live[writer], len(run.rows)
             run.rows.append(
@@ -218,7 +219,11 @@ class World:
         self.drop()
         reaches = self.robot.reaches()
         one = Connection(RobotEnd(), ServerEnd("r1"))
-        hello = Hello("r1", self.robot.disk.store_id, self.robot.boot, reaches, "", 0, 0, "1")
+        first = {w: reach for w, reach in reaches.items() if w in limits.FIRST_WRITERS}
+        hello = Hello(
+            "r1", self.robot.disk.store_id, self.robot.boot, first, "", 0, 0, "1",
+            more={"act": reaches["act"]},
+        )  # fmt: skip
         self._take(one, hello)
         answer = from_server(one.down.pop(0))
         assert isinstance(answer, Welcome)

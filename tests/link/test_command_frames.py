@@ -29,6 +29,7 @@ from amberbox.link.frames import (
     Bye,
     ChallengeFrame,
     CommandsFrame,
+    ConfirmFrame,
     FrameError,
     Hello,
     LeaseFrame,
@@ -79,6 +80,7 @@ def reason(actions: list[LinkAction]) -> str:
 
 UP: list[RobotFrame] = [
     ChallengeFrame(3, CHALLENGE, LeaseState(7, "server", "run", "")),
+    ChallengeFrame(3, CHALLENGE, waiting=ID, by_code=True, tries=2),
     ActionsFrame(3, b'[{"name": "dock"}]'),
     AnswersFrame(3, 1, [answer(1), answer(2)]),
 ]
@@ -87,7 +89,8 @@ DOWN: list[ServerFrame] = [
     AnsweredFrame(5),
     RevokedFrame(["0123456789abcdef"]),
     LeaseFrame("renew", "server", "run", 7),
-    AbortFrame(command=ID),
+    AbortFrame(command=ID, who="anna"),
+    ConfirmFrame(ID, "123456"),
 ]
 
 
@@ -102,7 +105,9 @@ def test_the_server_says_what_it_can_and_who_it_is() -> None:
     welcome = end.admitted(
         LinkAdmission(3, {}), 0, wants_folder=False, watch=(), server_id="9f" * 16
     )
-    assert (welcome.capabilities, welcome.server_id) == ([limits.COMMANDS], "9f" * 16)
+    known = [limits.COMMANDS, limits.ACT_ROWS, limits.PICTURES]
+    assert welcome.capabilities == [*known, limits.DETECT_JOURNALS]
+    assert welcome.server_id == "9f" * 16
 
 
 @pytest.mark.parametrize("frame", UP, ids=lambda frame: type(frame).__name__)
@@ -180,9 +185,9 @@ def test_the_largest_answer_fits_into_a_frame() -> None:
 def test_reports_of_the_gate_carry_the_epoch() -> None:
     end = welcomed(limits.COMMANDS)
     lease = LeaseState(1, "h", "r")
-    assert list(end.command_frames(MintedChallenge(CHALLENGE, lease))) == [
-        ChallengeFrame(3, CHALLENGE, lease)
-    ]
+    minted = MintedChallenge(CHALLENGE, lease, ID, by_code=True, tries=1)
+    [frame] = end.command_frames(minted)
+    assert frame == ChallengeFrame(3, CHALLENGE, lease, ID, by_code=True, tries=1)
     assert list(end.command_frames(ActionAnnouncement(b"[]"))) == [ActionsFrame(3, b"[]")]
     assert list(end.command_frames(GateAnswers([]))) == []
 
@@ -207,6 +212,9 @@ BAD_UP: list[tuple[str, dict[str, Any]]] = [
     ("challenge", {"lease": {"holder": "h" * 129}}),
     ("challenge", {"lease": {"run": "two\nlines"}}),
     ("challenge", {"epoch": -1}),
+    ("challenge", {"waiting": "the laser"}),
+    ("challenge", {"waiting": ID, "by_code": "yes"}),
+    ("challenge", {"tries": -1}),
     ("actions", {"announcement": bytes(limits.ACTIONS_BYTES + 1)}),
     ("actions", {"announcement": None}),
     ("answers", {"answers": [{"id": ID, "state": "well"}]}),
@@ -257,6 +265,9 @@ BAD_DOWN: list[tuple[str, dict[str, Any]]] = [
     ("lease", {"do": "renew", "holder": "h", "run": "r", "number": -1}),
     ("abort", {"run": "r" * 129}),
     ("abort", {"command": 5}),
+    ("abort", {"who": "w" * 129}),
+    ("code", {"command": "", "code": "123456"}),
+    ("code", {"command": ID, "code": "1" * 17}),
     ("welcome", {"epoch": 1, "cursor": {}, "server_wall_ns": 0, "server_id": "9" * 129}),
 ]
 
@@ -308,7 +319,7 @@ _VALUES = st.recursive(
 )  # fmt: skip
 _TAGS = st.sampled_from(
     ["challenge", "actions", "answers", "commands", "answered", "revoked", "lease", "abort",
-     "hello", "welcome", "later"]
+     "code", "hello", "welcome", "later"]
 )  # fmt: skip
 _FIELDS = st.sampled_from(
     ["epoch", "challenge", "lease", "announcement", "answers", "number", "commands", "keys", "do",
@@ -317,7 +328,7 @@ _FIELDS = st.sampled_from(
 
 
 @fuzz
-@settings(max_examples=examples(300), deadline=None)
+@settings(max_examples=examples(300))
 @given(_TAGS, st.dictionaries(_FIELDS, _VALUES, max_size=6))
 def test_hostile_frames_do_no_more_than_be_refused(tag: str, fields: dict[str, Any]) -> None:
     end = connected(limits.COMMANDS)

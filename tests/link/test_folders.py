@@ -7,7 +7,16 @@ import pytest
 import zstandard
 
 from amberbox.link import folders
-from amberbox.link.folders import FolderError, pack, travels, unpack
+from amberbox.link.folders import (
+    PICTURE_BYTES,
+    PICTURES_BYTES,
+    TAKEN_BYTES,
+    UNPACKED_BYTES,
+    FolderError,
+    pack,
+    travels,
+    unpack,
+)
 
 
 def _packed(files: object) -> bytes:
@@ -35,6 +44,28 @@ def test_names_that_travel() -> None:
     assert not any(map(travels, ("a.py", "a.yaml.py", ".a.yaml", "../a.yaml", "a", "a.so")))
 
 
+def test_pictures_of_experiments_go_to_servers_that_take_them() -> None:
+    files = {
+        "experiments/way.png": b"\x89PNG", "experiments/a.SVG": b"<svg/>", "robot.yaml": b"",
+        "experiments/deep/b.png": b"", "logo.png": b"", "experiments/.c.jpg": b"",
+    }  # fmt: skip
+    assert list(unpack(pack(files))) == ["robot.yaml"]
+    assert list(unpack(pack(files, pictures=True))) == [
+        "experiments/a.SVG", "experiments/way.png", "robot.yaml",
+    ]  # fmt: skip
+    with pytest.raises(FolderError, match=r"logo.png.*pictures of experiments/"):
+        unpack(_packed({"logo.png": b""}))
+
+
+def test_pictures_are_bounded() -> None:
+    with pytest.raises(FolderError, match="pictures have"):
+        unpack(_packed({"experiments/a.png": bytes(PICTURE_BYTES + 1)}))
+    count = PICTURES_BYTES // PICTURE_BYTES + 1
+    many = {f"experiments/{n}.png": bytes(PICTURE_BYTES) for n in range(count)}
+    with pytest.raises(FolderError, match="pictures have"):
+        unpack(_packed(many))
+
+
 @pytest.mark.parametrize(
     "name",
     ["../robot.yaml", "/etc/robot.yaml", "a/../../b.yaml", "a//b.yaml", "", "a\\b.yaml", "./a.yaml",
@@ -59,7 +90,7 @@ def test_a_file_is_no_folder_at_the_same_time() -> None:
 def test_a_bomb_does_not_go_off() -> None:
     bomb = _packed({"a.txt": bytes(64 << 20)})
     assert len(bomb) < 100_000
-    with pytest.raises(FolderError, match="at most 33554432 bytes"):
+    with pytest.raises(FolderError, match=f"at most {UNPACKED_BYTES + PICTURES_BYTES} bytes"):
         unpack(bomb)
 
 
@@ -79,8 +110,8 @@ def test_files_are_counted() -> None:
 
 
 def test_too_much_is_refused_before_it_is_read() -> None:
-    with pytest.raises(FolderError, match="at most 8388608 bytes"):
-        unpack(bytes(folders.PACKED_BYTES + 1))
+    with pytest.raises(FolderError, match=f"at most {TAKEN_BYTES} bytes"):
+        unpack(bytes(TAKEN_BYTES + 1))
 
 
 _SOUND = _packed({"a.yaml": b""})

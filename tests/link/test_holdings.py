@@ -54,7 +54,7 @@ def lacking(
 
 @fuzz
 @given(COPIES, COPIES, st.data())
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60))
 def test_exactly_what_is_not_held_is_found(
     counted_on: list[JournalCopy], others: list[JournalCopy], data: st.DataObject
 ) -> None:

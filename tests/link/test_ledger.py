@@ -186,6 +186,6 @@ class ComparedMachine(LinkMachine):
 
 
 TestLink = LinkMachine.TestCase
-TestLink.settings = settings(max_examples=50, stateful_step_count=25, deadline=None)
+TestLink.settings = settings(max_examples=50, stateful_step_count=25)
 TestDatabase = ComparedMachine.TestCase
-TestDatabase.settings = settings(max_examples=10, stateful_step_count=20, deadline=None)
+TestDatabase.settings = settings(max_examples=10, stateful_step_count=20)

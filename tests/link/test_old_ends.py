@@ -71,7 +71,7 @@ REACH = WriterReach(
 )
 OF_ROBOTS: list[RobotFrame] = [
     Hello("r1", "s", "b", {"watch": REACH}, "", 1, 2, "3", public_key="k",
-          capabilities=[limits.COMMANDS, "of a later version"]),
+          capabilities=[limits.COMMANDS, "of a later version"], more={"act": REACH}),
     RowsFrame(1, 1, [LinkRow("watch", 1, 1, "amberbox/status", 5, b"{}")],
               {"watch": JournalPosition(1, 2)}),
     DurableFrame(1, {"watch": REACH}),
@@ -176,6 +176,9 @@ def test_an_old_robot_is_sent_nothing_new(database: ServerDatabase) -> None:
     """Commands wait for it, and keys are revoked; all that comes, its code understands."""
     says = [bytes.fromhex(one["bytes"]) for one in RECORDED["from robot"]]
     created(database, "ropod_001", revoked="0123456789abcdef")
+    said = from_robot(says[0])
+    assert isinstance(said, Hello)
+    writers = said.writers.keys()
 
     async def scene() -> None:
         async with serving_one(database, "ropod_001") as (link, socket):
@@ -183,6 +186,7 @@ def test_an_old_robot_is_sent_nothing_new(database: ServerDatabase) -> None:
                 socket.up.put_nowait(data)
             welcome = old_wire.from_server(await socket.hear_bytes())
             assert isinstance(welcome, old_wire.Welcome) and welcome.epoch == 3
+            assert welcome.cursor.keys() == writers
             ack = old_wire.from_server(await socket.hear_bytes())
             assert isinstance(ack, old_wire.Ack)
             link.send_commands()
@@ -205,12 +209,16 @@ def test_an_old_robot_is_sent_nothing_new(database: ServerDatabase) -> None:
     asyncio.run(scene())
 
 
+OLD_WRITERS = {"main", "keep", "watch"}
+
+
 class OldServer:
     """A server of the old version at the other end of a line; it stores nothing, and says so."""
 
-    def __init__(self) -> None:
+    def __init__(self, cursor: old_wire.Cursor | None = None) -> None:
         self.heard: list[old_wire.RobotFrame] = []
         self.rows = 0
+        self._cursor = cursor or {}
         self._down: asyncio.Queue[bytes | None] = asyncio.Queue()
 
     async def receive(self) -> bytes:
@@ -222,12 +230,16 @@ class OldServer:
     async def send(self, data: bytes) -> None:
         frame = old_wire.from_robot(data)  # an old server would end the link over a new frame
         self.heard.append(frame)
+        if isinstance(frame, old_wire.Hello | old_wire.Durable):
+            assert set(frame.writers) <= OLD_WRITERS  # nor over a writer that it does not know
         if isinstance(frame, old_wire.Hello):
             assert frame.protocol == 1
-            self._say(old_wire.Welcome(1, dict.fromkeys(frame.writers, old_wire.Place()), 5))
+            cursor = dict.fromkeys(frame.writers, old_wire.Place()) | self._cursor
+            self._say(old_wire.Welcome(1, cursor, 5))
         elif isinstance(frame, old_wire.Beat):
             self._say(old_wire.Pong(5, frame.mono_ns))
         elif isinstance(frame, old_wire.Rows):
+            assert {*frame.upto, *(row.writer for row in frame.rows)} <= OLD_WRITERS
             self.rows += len(frame.rows)
             self._say(old_wire.Ack(frame.number, {}))
 
@@ -257,6 +269,38 @@ def test_a_new_robot_with_a_gate_keeps_it_to_itself_at_an_old_server(tmp_path: P
             assert client.progress.connected and client.progress.attempts == 1
             assert client.progress.unknown_frames == 0
         assert gate.begun == [] and [one.number for one in gate.unanswered()] == [1]
+        watcher.close()
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize("cursor", [{}, {"act": old_wire.Place(2, 3)}], ids=["old", "downgraded"])
+def test_an_old_server_hears_nothing_of_the_command_process(
+    tmp_path: Path, cursor: old_wire.Cursor
+) -> None:
+    """Neither its rows nor its journals: over those it would end the link, or never take them."""
+
+    async def scene() -> None:
+        watcher, act = Watcher(tmp_path / "store"), Watcher(tmp_path / "store", writer="act")
+        watcher.write(20)
+        act.report(5)
+        server = OldServer(cursor)
+
+        async def dial(*_: object) -> OldServer:
+            return server
+
+        client = LinkClient(
+            watcher.store, LinkOptions("http://127.0.0.1:1", "r1", "key"), dialer=dial,
+            network=lambda: Network("eth0"), backoff=Backoff(least_s=0.05, most_s=0.1),
+        )  # fmt: skip
+        async with linked(client):
+            await until(lambda: server.rows == 20)
+            watcher.write(5)
+            act.report(5)
+            await until(lambda: server.rows == 25)
+            assert client.progress.attempts == 1
+            assert client.left_out == {"act", "experiment", "detect"}
+        act.close()
         watcher.close()
 
     asyncio.run(scene())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -152,6 +153,38 @@ def test_what_is_urgent_goes_first_and_upto_waits_for_the_rest() -> None:
     assert [[r.seq for r in f.rows] for f in frames if f] == [[6], [5, 7], [0, 1, 2, 3, 4]]
     assert [f.upto for f in frames if f] == [{}, {}, {"watch": JournalPosition(1, 8)}]
     assert end.next_rows() is None
+
+
+def test_alarms_do_not_wait_behind_the_reports_of_an_action() -> None:
+    end = RobotEnd()
+    ends = {"watch": JournalPosition(1, 0), "act": JournalPosition(2, 0)}
+    end.welcome(Welcome(1, {}, 0, capabilities=[limits.ACT_ROWS]), ends)
+    reports = [LinkRow("act", 2, n, channels.COMMAND, 5, b"x" * 500) for n in range(2000)]
+    end.offer_fresh("act", reports, JournalPosition(2, 2000))
+    end.offer_fresh("watch", [row(0), row(1, channels.ALARM)], JournalPosition(1, 2))
+    frames = [frame for frame in (end.next_rows() for _ in range(9)) if frame is not None]
+    assert frames[0].rows == [row(1, channels.ALARM)] and frames[-1].rows == [row(0)]
+    assert [one for frame in frames[1:-1] for one in frame.rows] == reports
+
+
+def test_rows_of_the_command_process_go_only_where_they_are_taken() -> None:
+    """Also not to an older server whose database still knows where a newer one was."""
+    end = RobotEnd()
+    ends = {"watch": JournalPosition(1, 0), "act": JournalPosition(2, 0)}
+    end.welcome(Welcome(1, {"act": JournalPosition(2, 0)}, 0), ends)
+    assert end.writers == ("main", "keep", "watch")
+    with pytest.raises(KeyError):
+        end.starts("act")
+
+
+def test_the_server_takes_journals_of_later_writers_apart_from_those_it_always_knew() -> None:
+    end = ServerEnd("r1")
+    said_more = {"act": REACH, "of a later version": REACH}
+    [admit] = end.receive(msgspec.structs.replace(hello(), more=said_more))
+    assert isinstance(admit, AdmitRobot) and admit.hello.writers.keys() == {"watch", "act"}
+    wrong = WriterReach(JournalPosition(1, 0), JournalPosition(1, 3), JournalPosition(1, 9))
+    frame = msgspec.structs.replace(hello(), more={"act": wrong})
+    assert "more is durable" in said(ServerEnd("r1"), frame)
 
 
 def test_a_metered_network_carries_no_backlog() -> None:

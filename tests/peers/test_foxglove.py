@@ -148,9 +148,9 @@ def hear_until_heard(box: ManualBox, client: Viewer, topic: str) -> None:
 
 
 @contextmanager
-def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+def program(*arguments: str, verb: str = "foxglove") -> Iterator[tuple[subprocess.Popen[str], int]]:
     """Run the verb as a program of its own; gives process and port."""
-    words = command("foxglove", *arguments, "--port", "0")
+    words = command(verb, *arguments, *(["--port", "0"] if verb == "foxglove" else []))
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -264,6 +264,24 @@ def test_a_viewer_controls_the_playback(store: Path) -> None:
         client.wait(lambda: client.states[-1].status == ENDED)
         client.wait(lambda: len(client.messages("/count")) == 20)
         assert client.messages("/count") == [number(count) for count in range(80, 100)]
+
+
+def test_play_serves_viewers_again_and_again(store: Path) -> None:
+    options = ["--to", "foxglove=0", "--loop", "--start-paused", "--prefix", "/replay"]
+    with (
+        program(str(store), *options, "--speed", "100", verb="play") as (process, port),
+        viewer(port) as client,
+    ):
+        client.subscribe("/replay/count", "/replay/name")
+        client.wait(lambda: client.states and client.states[-1].status == PAUSED)
+        assert not client.messages("/replay/count")
+        client.control(play=True, speed=1000)
+        counts = [number(count) for count in range(100)]
+        client.wait(lambda: len(client.messages("/replay/count")) >= 200)
+        assert client.messages("/replay/count")[:200] == counts + counts
+        assert ENDED not in {state.status for state in client.states}
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_range_of_columns_keeps_its_pace(store: Path) -> None:

@@ -301,3 +301,29 @@ def test_all_topics_of_the_last_run_are_gaps_until_they_are_heard(
         stop.set()
         thread.join(PATIENCE_S)
     assert links(again)[:2] == [("down", "a", "publisher not connected yet"), ("up", "a", "")]
+
+
+def test_a_pattern_subscribes_to_its_beginning_and_leaves_out_what_it_does_not_match(
+    context: zmq.Context[Any],
+) -> None:
+    publisher, port = bind_publisher(context)
+    topics = [
+        ZmqTopic(name="cam/*/state", type="json", sequence="n"),
+        ZmqTopic(name="odom", type="json"),
+    ]
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=topics, exclude=["odom/raw"])
+    with observe(Source(config, "z")) as sink:
+        subscribed = {await_subscription(publisher), await_subscription(publisher)}
+        assert subscribed == {b"cam/", b"odom"}
+        for number in (1, 2, 5):
+            for topic in (b"cam/a/state", b"cam/a/b/state", b"odom/raw", b"odom/fine"):
+                publisher.send_multipart([topic, b'{"n": %d}' % number])
+        publisher.send(b"cam/\xff")
+        publisher.send_multipart([b"odom", b"{}"])
+        sink.wait_for("odom", 1)
+    names = {topic.name for topic in sink.topics}
+    assert names == {"cam/a/state", "odom/fine", "odom"}
+    assert len(sink.of("cam/a/state")) == 3
+    assert [(topic, count) for topic, *_, count, _ in sink.losses] == [("cam/a/state", 2)]
+    assert [kind for kind, _, _ in sink.events] == ["unnamed"]
+    assert sink.saved["topics"] == {config.endpoint: ["cam/a/state", "odom/fine"]}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+import time
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,7 @@ from amberbox.server.app import make_app
 from amberbox.server.config import ServerSettings
 from amberbox.server.database import FILE
 from amberbox.server.http.auth import COOKIE, CSRF_HEADER
-from amberbox.testing.clock import ManualClock
+from amberbox.testing.clock import PATIENCE_S, ManualClock
 
 URL = "https://fleet.example"
 PASSWORD = "a long enough passphrase"
@@ -134,3 +136,26 @@ def house(folder: Path, *, shared: bool = False) -> Iterator[House]:
         yield found
     finally:
         found.close()
+
+
+def work_until(
+    work: Callable[[], Coroutine[Any, Any, None]],
+    until: Callable[[], bool],
+    begun: Callable[[], None] | None = None,
+) -> None:
+    """Let a service of the server work until something is so; call ``begun`` once it waits."""
+
+    async def run() -> None:
+        task = asyncio.create_task(work())
+        if begun is not None:
+            await asyncio.sleep(0.05)
+            begun()
+        ends = time.monotonic() + PATIENCE_S
+        while not until() and time.monotonic() < ends:
+            await asyncio.sleep(0.02)
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    assert until()

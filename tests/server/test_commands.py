@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -403,6 +404,32 @@ def test_another_store_counts_its_answers_anew(rows: Rows) -> None:
     rows.answer(epoch, said(one, "outcome_unknown", 1), store_id="another")
     assert rows.do(lambda c: commands.begin_contact(c, "r1", epoch, "another")).answered == 1
     assert rows.find(one).state == "outcome_unknown"
+
+
+def test_of_commands_that_are_not_known_here_so_many_are_kept(
+    rows: Rows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "MOST_UNKNOWN", 3)
+    epoch, known = rows.connect(), rows.create(command())
+    stray = [dataclasses.replace(known, id=f"{n:032x}") for n in range(5)]
+    found = rows.answer(epoch, *(said(one, "done", n + 1) for n, one in enumerate(stray[:2])))
+    assert found.unknown == (stray[0].id, stray[1].id)
+    found = rows.answer(epoch, *(said(one, "done", n + 3) for n, one in enumerate(stray[2:])))
+    assert (found.unknown, found.number) == ((stray[2].id,), 5), "it need not send them again"
+    assert rows.answer(epoch, said(stray[0], "failed", 6)).unknown == ()
+    rows.answer(epoch, said(known, "done", 7))
+    assert rows.find(known).state == "done"
+
+
+def test_a_robot_that_answers_without_end_fills_nothing(rows: Rows) -> None:
+    one = rows.create(command())
+    epoch = rows.connect()
+    for number in range(1, 200, 10):
+        many = [said(one, "accepted", number + n) for n in range(10)]
+        assert rows.answer(epoch, *many).number == number + 9, "it need not send them again"
+    assert len(rows.find(one).answers) == commands.MOST_ANSWERS
+    rows.answer(epoch, said(one, "done", 300))
+    assert rows.find(one).state == "done"
 
 
 def test_an_older_log_of_the_same_store_is_acknowledged_by_its_own_numbers(rows: Rows) -> None:

@@ -38,7 +38,6 @@ CHECKS = [
 ]
 SETTINGS = settings(
     max_examples=EXAMPLES,
-    deadline=None,
     database=None,
     derandomize=EXAMPLES < 100,
     phases=[Phase.explicit, Phase.generate],

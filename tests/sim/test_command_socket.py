@@ -192,7 +192,7 @@ def test_a_client_that_goes_away_leaves_the_motion_to_its_end(served: Served) ->
 
 @fuzz
 @given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode))
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100))
 def test_any_bytes_are_a_request_or_an_error(data: bytes) -> None:
     try:
         request = decode_request(data)
@@ -213,7 +213,7 @@ _DO = st.sampled_from(["linear", "rotate", "go_to", "load", "stop", "status", "r
 
 @fuzz
 @given(_DO, st.dictionaries(_KEYS, _VALUES, max_size=4))
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100))
 def test_any_object_is_answered(do: str, request: dict[str, Any]) -> None:
     robot = Robot(3, scenario="standing")
     try:

@@ -600,3 +600,20 @@ def test_wrong_requests_are_named(request_: dict[str, Any], part: str) -> None:
         Robot().command(request_)
     assert part in caught.value.what and caught.value.hint
     assert len(str(caught.value)) < 600
+
+
+def test_a_restarted_process_works_again_and_the_robot_keeps_its_tasks() -> None:
+    robot = Robot(3)
+    run_for(robot, 2.0)
+    for fault in ("laser_front_driver_crash", "navigation_hang"):
+        robot.inject(fault)
+    run_for(robot, 3.0)
+    assert not robot.host.is_working("laser_front")
+    answer = robot.command({"do": "restart", "process": "laser_front"})
+    assert (answer["ok"], answer["state"]) == (True, "done")
+    run_for(robot, 6.0)
+    assert robot.host.is_working("laser_front") and not robot.host.is_working("navigation")
+    assert [fault.id for fault in robot.active_faults()] == ["navigation_hang"]
+    assert status(robot)["control"] == "tasks"
+    with pytest.raises(UsageError, match="is none of"):
+        robot.command({"do": "restart", "process": "init"})

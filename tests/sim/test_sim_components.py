@@ -13,7 +13,7 @@ from amberbox.sim.faults import catalogue
 from amberbox.sim.robot import Robot
 from tests.sim.monitored import FAULT_S, alarms, failures, find, plan_of, with_fault
 
-INITIALISED_S = 6.0
+INITIALISED_S = 11.0  # the residual of the gyroscope looks back for 10 s
 SAMPLE = {  # fault: seconds until its component must have an alarm
     "wheel_rear_left_phase_open": 20.0,
     "wheel_front_right_encoder_stuck": 3.0,

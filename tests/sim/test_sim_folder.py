@@ -12,12 +12,17 @@ import pytest
 import yaml
 
 from amberbox import sim
+from amberbox.agent.recovery_actions import command_lines, recovery_actions
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main
+from amberbox.consult.folder_knowledge import load_knowledge
 from amberbox.core.errors import UsageError
+from amberbox.experiments.action import read_actions
 from amberbox.sim.noise import Noise
 from amberbox.sim.requests import MOTIONS, REQUESTS, check_request
 from amberbox.sim.world import CART_PLACES, PLACES, HospitalWorld
 from tests.sim.commanded import begin, end, standing
+from tests.sim.monitored import plan_of
 
 FOLDER = Path(sim.__file__).parent / "folder"
 EXAMPLES: dict[str, dict[str, Any]] = {
@@ -29,7 +34,10 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "load": {"area": "ward_a"},
     "unload": {"area": "ward_a"},
     "stop": {},
+    "restart_process": {"process": "laser_front"},
+    "resume_tasks": {},
 }
+CALM = ("stop", "restart_process", "resume_tasks")
 
 
 def read(name: str) -> Any:
@@ -66,10 +74,12 @@ def filled(template: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
 def test_every_motion_is_an_action_that_can_be_stopped() -> None:
     actions = read("actions/sim.yaml")
     assert set(actions) == set(EXAMPLES)
-    assert {action["request"]["do"] for action in actions.values()} == {*MOTIONS, "stop"}
+    done = {action["request"]["do"] for action in actions.values()}
+    assert done == {*MOTIONS, "stop", "restart", "resume"}
     for name, action in actions.items():
-        assert (action["kind"], action["risk"]) == ("zmq_request", "moves"), name
-        assert action["safe_stop"] == {"do": "stop"} and action["description"]
+        risk, stop = ("state", None) if name in CALM else ("moves", {"do": "stop"})
+        assert (action["kind"], action["risk"]) == ("zmq_request", risk), name
+        assert action.get("safe_stop") == stop and action["description"]
         assert action["expect"] == {"ok": True}
         assert set(action.get("parameters", {})) == set(EXAMPLES[name])
 
@@ -102,3 +112,15 @@ def test_a_new_folder_has_them(tmp_path: Path) -> None:
     for name in ("map.yaml", "areas.yaml", "actions/sim.yaml"):
         assert (tmp_path / "robot" / name).read_text() == (FOLDER / name).read_text()
     assert main(["check", str(tmp_path / "robot")]) == 0
+
+
+def test_what_the_failure_modes_name_for_recovery_can_be_run(tmp_path: Path) -> None:
+    plan, _ = plan_of(tmp_path / "robot")
+    knowledge, _ = load_knowledge(load_folder(tmp_path / "robot"), plan)
+    assert knowledge is not None
+    actions, _ = read_actions(tmp_path / "robot")
+    found = recovery_actions(plan, knowledge.fmea, actions)
+    assert [one for one in found if not one.action] == []
+    assert {"laser_front#driver_crash", "localisation#hang"} <= {one.cause for one in found}
+    lines = list(command_lines(found, ["laser_rear#driver_crash"], "a robot"))
+    assert lines == ["amberbox action run 'a robot' restart_process process=laser_rear"]

@@ -14,6 +14,7 @@ from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.source import TopicOptions
 from amberbox.core.yaml_nodes import parse_yaml
+from amberbox.sim.disturbances import Disturbance
 from amberbox.sim.robot import START_NS
 from amberbox.sim.topics import TOPICS
 from amberbox.testing.contract import MemorySink
@@ -62,6 +63,34 @@ def test_a_limited_speed_is_kept_and_stamps_by_the_box() -> None:
     took_ns = sink.messages[-1][2] - sink.messages[0][2]
     assert took_ns > 200_000_000
     assert abs(sink.messages[0][2] - sink.links[0][4]) < 2_000_000_000
+
+
+def test_disturbances_change_what_is_received() -> None:
+    late = Disturbance("delay", "wifi", amount=0.7)
+    wrong = Disturbance("offset", "battery", "temperature", amount=100.0, at_s=1.0)
+    usual = _run(Config(speed="max", duration_s=2.0))
+    sink = _run(Config(speed="max", duration_s=2.0, disturbances=(late, wrong)))
+    hot = [json.loads(data)["temperature"] > 100 for data in sink.of("battery")]
+    assert hot == [False, False, True, True]
+    wifi = next(n for n, topic in enumerate(sink.topics) if topic.name == "wifi")
+    times_ns, late_ns = ([m[2] for m in each.messages if m[0] == wifi] for each in (usual, sink))
+    assert late_ns == [time_ns + 700_000_000 for time_ns in times_ns]
+    assert sink.of("odom") == usual.of("odom")
+
+
+@pytest.mark.parametrize(
+    ("entry", "part"),
+    [
+        ("{kind: drop, item: odum}", "did you mean 'odom'"),
+        ("{kind: sign, item: battery, variable: curent}", "did you mean 'current'"),
+        ("{kind: sign, item: battery}", "sign needs a variable"),
+    ],
+)
+def test_wrong_disturbances_are_reported(entry: str, part: str) -> None:
+    problems: list[Problem] = []
+    node = parse_yaml(f"disturbances: [{entry}]", "black_box.yaml", problems)
+    assert node is not None and build(Config, node, problems) is None
+    assert len(problems) == 1 and part in str(problems[0])
 
 
 class _Clock(threading.Event):

@@ -55,11 +55,14 @@ class ManualBox:
     source: str = "ros"
     start_gap_ns: int | None = None
     room: DiskRoom | None = None
+    late_s: float = 0.0
 
     def __post_init__(self) -> None:
         store, clock = create_store(self.store), RunClock(self.clock)
         self.pipeline = Pipeline(store, clock, self.options, self.start_gap_ns, self.room)
-        self.sink = BlockSink(self.pipeline, self.source, self.topics, lossless=False)
+        self.sink = BlockSink(
+            self.pipeline, self.source, self.topics, lossless=False, late_s=self.late_s
+        )
 
     def hear(self, topic: Topic, *messages: bytes) -> None:
         """Receive messages of a topic now."""

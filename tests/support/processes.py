@@ -8,25 +8,41 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TypeVar
+from random import SystemRandom
+from typing import ParamSpec, TypeVar
 
 from amberbox.testing.clock import PATIENCE_S, wait_until
 
 LOOPBACK = "127.0.0.1"
+_PORTS_GIVEN = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_UNPRIVILEGED = 1_024
+_CHANCE = SystemRandom()  # tests seed the common one, in each worker alike
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def free_port() -> int:
-    """Return a free TCP port of this computer."""
-    with socket.create_server((LOOPBACK, 0)) as probe:
-        return int(probe.getsockname()[1])
+    """Return a free TCP port, below those that the system gives to connections meanwhile."""
+    lowest = int(_PORTS_GIVEN.read_text().split()[0])
+    while True:
+        port = _CHANCE.randrange(_UNPRIVILEGED, lowest)
+        with suppress(OSError), socket.create_server((LOOPBACK, port)):
+            return port
 
 
 def command(*words: object) -> list[str]:
     """Return the command line of ``amberbox`` with these words."""
     return [sys.executable, "-m", "amberbox", *map(str, words)]
+
+
+def apart(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+    """Call a function in a process of its own, which a native library may crash."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments, **named).result()
 
 
 @contextmanager

@@ -50,6 +50,8 @@ class RosMaster:
         self.publishers: dict[str, dict[str, str]] = {}
         self.subscribers: dict[str, dict[str, str]] = {}
         self.services: dict[str, str] = {}
+        self.types: dict[str, str] = {}
+        self.parameters: dict[str, Any] = {}
         self.calls: list[str] = []
         self.announces = announces
         self._server = _serve(self._functions(), port)
@@ -73,12 +75,14 @@ class RosMaster:
     def _functions(self) -> dict[str, Callable[..., Any]]:
         return {
             "getSystemState": self._state,
+            "getTopicTypes": self._topic_types,
             "lookupNode": self._lookup,
             "registerSubscriber": self._subscribe,
             "unregisterSubscriber": self._unsubscribe,
             "registerPublisher": self._publish,
             "unregisterPublisher": self._unpublish,
             "lookupService": self._look_up_service,
+            "getParam": lambda caller, name: (1, "", self.parameters),
         }
 
     def _announce(self, topic: str) -> None:
@@ -92,7 +96,12 @@ class RosMaster:
     def _state(self, caller: str) -> Any:
         self.calls.append("getSystemState")
         tables = (self.publishers, self.subscribers)
-        return 1, "", [*([[t, list(n)] for t, n in table.items() if n] for table in tables), []]
+        state = [[[t, list(n)] for t, n in table.items() if n] for table in tables]
+        return 1, "", [*state, [[name, ["/server"]] for name in self.services]]
+
+    def _topic_types(self, caller: str) -> Any:
+        self.calls.append("getTopicTypes")
+        return 1, "", [[topic, self.types.get(topic, "*")] for topic in self.publishers]
 
     def _lookup(self, caller: str, node: str) -> Any:
         self.calls.append("lookupNode")
@@ -108,6 +117,7 @@ class RosMaster:
 
     def _publish(self, caller: str, topic: str, kind: str, uri: str) -> Any:
         self.calls.append("registerPublisher")
+        self.types[topic] = kind
         self.register(topic, caller, uri)
         return 1, "", list(self.subscribers.get(topic, {}).values())
 
@@ -159,6 +169,7 @@ class RosPublisher:
     def announce(self, topic: str) -> None:
         """Register a topic with the master."""
         if self._master is not None:
+            self._master.types[topic] = self.topics[topic].type
             self._master.register(topic, self.node, self.uri)
 
     def publish(self, topic: str, *messages: bytes) -> None:

@@ -13,6 +13,29 @@ import zmq
 
 from tests.support.processes import free_port, wait_for
 
+ACTIONS = """\
+drive:
+  description: Drive straight ahead
+  kind: zmq_request
+  endpoint: ENDPOINT
+  request: {do: linear, distance_m: "{distance_m}"}
+  poll: {do: state}
+  until: {moving: false}
+  poll_every: 0.05 s
+  safe_stop: {do: stop}
+  simulated: {at: "{distance_m}"}
+  simulated_for: 0 s
+  parameters:
+    distance_m: {unit: m, min: -2, max: 2}
+  risk: moves
+  timeout: 60 s
+light:
+  kind: zmq_request
+  endpoint: ENDPOINT
+  request: {do: light}
+  risk: state
+"""
+
 
 def boot_s() -> float:
     """Return seconds since boot, suspend included."""

@@ -102,7 +102,9 @@ def test_a_configuration_with_errors_is_told_and_the_rest_goes_on(
 
 
 def test_a_folder_that_names_nothing_built(folder: Path, host: HostSystem) -> None:
-    (folder / "black_box.yaml").write_text("- zenoh: {}\n")
+    (folder / "black_box.yaml").write_text("- opcua: {}\n")
+    assert "source 'opcua' is not built yet" in one(folder, "configuration", host).found
+    create_store(folder / "store").next_run()
     assert "no source that can be recorded" in one(folder, "configuration", host).found
 
 

@@ -12,6 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from amberbox.blackbox.columns import diagnostic_values
 from amberbox.blackbox.columns.ros_messages import RosUnroller
 from amberbox.core.types import ColumnData, ItemSchema, Ragged, Rows, Schema
 
@@ -54,6 +55,8 @@ def check_columns(rows: Rows, schema: ItemSchema, messages: Sequence[Any]) -> in
         check_column(rows.columns[column.name], column.type, expected)
         compared += len(expected)
     for path, child in schema.children.items():
+        if path == diagnostic_values.PATH:  # no part of the message
+            continue
         lists = list(map(getter(path), messages))
         table = rows.children[path]
         parents = np.repeat(np.arange(len(lists)), [len(items) for items in lists])

@@ -221,7 +221,7 @@ def assert_identical(left: Rows, right: Rows, schema: ItemSchema) -> None:
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, suppress_health_check=list(HealthCheck))
 @given(typed=typed_messages())
 def test_both_decoders_agree_with_rosbags(cdr: bool, typed: tuple[Type, list[Any]]) -> None:
     kind, messages = typed
@@ -234,7 +234,7 @@ def test_both_decoders_agree_with_rosbags(cdr: bool, typed: tuple[Type, list[Any
     assert_identical(fast.rows(data), slow.rows(data), fast.schema)
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, suppress_health_check=list(HealthCheck))
 @given(typed=typed_messages())
 def test_byte_orders_may_mix_in_a_batch(typed: tuple[Type, list[Any]]) -> None:
     kind, messages = typed
@@ -246,7 +246,7 @@ def test_byte_orders_may_mix_in_a_batch(typed: tuple[Type, list[Any]]) -> None:
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=50, suppress_health_check=list(HealthCheck))
 @given(typed=typed_messages(), data=st.data())
 def test_damaged_messages_are_named_or_read_as_rosbags_reads_them(
     cdr: bool, typed: tuple[Type, list[Any]], data: st.DataObject

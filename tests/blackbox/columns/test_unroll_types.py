@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from amberbox.blackbox.columns import UnrollError
-from amberbox.blackbox.columns.ros_layout import MOST_LAYOUTS
+from amberbox.blackbox.columns.layout_cache import MOST_LAYOUTS
 from amberbox.blackbox.columns.ros_messages import RosUnroller
 from amberbox.blackbox.columns.unroll import unroller
 from amberbox.core.errors import AmberboxError, UsageError
@@ -335,7 +335,7 @@ def test_a_name_that_changes_now_and_then_keeps_the_layouts() -> None:
 
 
 def test_large_batches_are_joined_in_portions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amberbox.blackbox.columns.ros_messages._LARGEST_JOIN", 40)
+    monkeypatch.setattr("amberbox.blackbox.columns.layout_cache._LARGEST_JOIN", 40)
     images = ros1("uint8[] data\nint32[] n\np/N[] c\n" + N)
     batch = [struct.pack(f"<I{i}sIiIi", i, b"x" * i, 1, i, 1, i) for i in range(12)]
     rows = images.rows(batch)

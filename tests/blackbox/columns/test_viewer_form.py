@@ -81,14 +81,14 @@ def columns(schema: Schema) -> ItemSchema:
     return unroller(Topic("/t", "json", schema)).schema
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(VALUES, min_size=1, max_size=5))
 def test_viewers_take_whatever_was_inferred(values: list[Any]) -> None:
     document = json.loads(learn(*values).data)
     assert [reason for value in values for reason in refusals(document, value)] == []
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(VALUES, min_size=1, max_size=5))
 def test_a_schema_tells_all_that_was_seen(values: list[Any]) -> None:
     schema = learn(*values)

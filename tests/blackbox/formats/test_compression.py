@@ -96,7 +96,7 @@ def test_a_packed_collection_is_unpacked_little_by_little(tmp_path: Path) -> Non
 
 
 @fuzz
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(st.sampled_from(list(PACKERS)), st.binary(max_size=3000), st.integers(0, 4000), st.data())
 def test_damaged_data_unpack_as_far_as_they_go(
     name: str, data: bytes, promised: int, draw: st.DataObject

@@ -303,7 +303,7 @@ def test_commas_are_decimal_points_where_they_separate_nothing_else() -> None:
     assert kind_of("1.234,5", comma=True) == "text"
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.one_of(st.floats(), st.integers(-(2**60), 2**60), st.none()), max_size=20))
 def test_numbers_come_back_as_they_were_written(values: list[float | int | None]) -> None:
     cells = ["" if value is None else repr(value) for value in values]
@@ -317,7 +317,7 @@ def test_numbers_come_back_as_they_were_written(values: list[float | int | None]
         assert same
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0\r")), min_size=2,

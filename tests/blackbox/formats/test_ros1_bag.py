@@ -60,9 +60,7 @@ def test_messages_out_of_order_come_in_order(
 
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
-@settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 1))
 def test_truncated_bag_gives_a_prefix(
     tmp_path: Path, messages: Messages, ros1_bag: WriteBag, compression: str, share: float
@@ -84,9 +82,7 @@ def test_truncated_bag_gives_a_prefix(
 
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
-@settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 1), length=st.sampled_from([1, 100, 4096]), fill=st.binary(min_size=1))
 def test_damage_costs_only_what_it_touches(
     tmp_path: Path,
@@ -158,7 +154,6 @@ def test_a_damaged_chunk_header_costs_no_message(
 @fuzz
 @settings(
     max_examples=examples(60),
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))

@@ -203,7 +203,7 @@ def cut(data: bytearray, rng: random.Random) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("damage", [flip, zero, cut])
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32))
 @example(seed=2420)  # flips an index record into one that ends the data
 def test_damage_costs_only_the_chunks_it_touches(
@@ -235,7 +235,7 @@ def test_damage_costs_only_the_chunks_it_touches(
         assert found.damage or not found.finished, "rows are missing and nothing says so"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32))
 def test_swapped_pages_keep_the_order(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     path, rows = finished(tmp_path_factory.mktemp("swap"), seed=6)

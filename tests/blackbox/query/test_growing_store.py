@@ -190,7 +190,7 @@ def test_sql_shows_all_columns(live: ManualBox, what: str) -> None:
 
 
 @fuzz
-@settings(max_examples=examples(6), deadline=None)
+@settings(max_examples=examples(6))
 @given(seed=st.integers(0, 2**32), writes=st.integers(1, 60))
 def test_answers_stay_the_same(
     tmp_path_factory: pytest.TempPathFactory, seed: int, writes: int
@@ -250,7 +250,7 @@ def test_child_tables_of_a_long_live_journal_are_estimated(live: ManualBox) -> N
 
 
 @fuzz
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(seed=st.integers(0, 2**32))
 def test_damage_of_a_live_journal_costs_what_it_touches(
     tmp_path_factory: pytest.TempPathFactory, seed: int
@@ -312,7 +312,7 @@ def test_items_whose_type_changes_are_counted_together(tmp_path: Path) -> None:
 
 
 @fuzz
-@settings(max_examples=examples(5), deadline=None)
+@settings(max_examples=examples(5))
 @given(seed=st.integers(0, 2**32))
 def test_an_index_is_believed_or_refused(
     tmp_path_factory: pytest.TempPathFactory, seed: int

@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 import amberbox
+from amberbox.blackbox.columns import diagnostic_values
 from amberbox.blackbox.columns.ros_messages import RosUnroller
 from amberbox.blackbox.query.importing import import_recordings
 from amberbox.blackbox.query.record import Record
@@ -63,6 +64,8 @@ def check_table(
         check_column(table[column.name], column.type, list(map(getter(column.path), messages)))
     compared = len(messages) * len(schema.columns)
     for path, child in schema.children.items():
+        if path == diagnostic_values.PATH:  # no part of the message
+            continue
         lists = list(map(getter(path), messages))
         if any(map(len, lists)):
             below = [part for items in lists for part in items]

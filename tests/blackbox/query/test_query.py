@@ -144,6 +144,20 @@ def test_following_gives_the_same_rows(store: Path) -> None:
     ]
 
 
+def test_conclusions_and_commands_are_followed_too(tmp_path: Path) -> None:
+    FakeRun(tmp_path).write([(T0_NS, BATTERY, {"volts": 1.0})])
+    for writer, topic in (("watch", "amberbox/status"), ("act", "amberbox/command")):
+        run = FakeRun(tmp_path, writer=writer)
+        for number in range(3):
+            run.own(topic, T0_NS + number * NS, {"state": f"{writer} {number}"})
+        run.close()
+        tables = follow_tables(
+            amberbox.open(tmp_path), topic.replace("/", "_"), ["state"], T0_NS + NS, live=False
+        )
+        found = [state for table in tables for state in table.values("state")]
+        assert found == [f"{writer} 1", f"{writer} 2"]
+
+
 def test_writers_and_runs_are_merged_by_receipt(tmp_path: Path) -> None:
     first = FakeRun(tmp_path)
     first.write([(T0_NS + n * 10, BATTERY, {"volts": float(n)}) for n in range(0, 40, 2)])

@@ -56,7 +56,7 @@ def live(box: ManualBox, rng: random.Random) -> dict[str, int]:
     return sent
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32))
 def test_the_counters_add_up(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng, store = random.Random(seed), tmp_path_factory.mktemp("accounts") / "store"

@@ -333,7 +333,7 @@ def test_a_ring_elsewhere_goes_on_and_its_own_full_disk_holds_nobody_up(
     assert {gap.reason for gap in gaps} == {"dropped: no room for the ring"}
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32))
 def test_accounts_are_exact_whatever_the_disk_does(
     tmp_path_factory: pytest.TempPathFactory, seed: int

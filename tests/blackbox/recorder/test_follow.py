@@ -79,7 +79,7 @@ def per_item(rows: list[Row]) -> dict[str, list[int]]:
     return {item: [n for name, n in rows if name == item] for item in ITEMS}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32))
 def test_a_follower_that_is_killed_goes_on_where_it_was(
     tmp_path_factory: pytest.TempPathFactory, seed: int
@@ -104,7 +104,7 @@ def test_a_follower_that_is_killed_goes_on_where_it_was(
     assert per_item(got) == per_item(said)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32))
 def test_damage_is_a_gap_and_everything_else_is_delivered_once(
     tmp_path_factory: pytest.TempPathFactory, seed: int

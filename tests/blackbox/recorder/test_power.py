@@ -47,7 +47,7 @@ def record(store_path: Path, ticks: int) -> dict[Path, list[tuple[int, int]]]:
 
 
 @pytest.mark.parametrize("torn", ["dropped", "zeroed", "garbage"])
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32), ticks=st.integers(1, 60))
 def test_everything_synced_survives(
     tmp_path_factory: pytest.TempPathFactory, torn: str, seed: int, ticks: int

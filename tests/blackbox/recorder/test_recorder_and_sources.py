@@ -89,6 +89,30 @@ def test_what_is_configured_is_known_from_the_first_file_on(
     assert before == amberbox.open(store).query("ros_pose").names == ["timestamp", "y"]
 
 
+def test_topics_that_a_pattern_finds_get_its_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    schema = Schema("a/Pose", "ros1msg", b"float64 x\nfloat64 y\n")
+
+    def run(self: object, sink: Sink, stop: threading.Event) -> None:
+        for name in ("/cam/a", "/cam/b", "/odom"):
+            sink.link_up(name, "peer")
+            sink.message(sink.topic(Topic(name, "ros1", schema)), bytes(16), sink.now_ns())
+        stop.wait()
+
+    monkeypatch.setattr(ros_source.Source, "run", run)
+    topics = "{name: /cam/b, keep: bulk}, {name: /cam/*, keep: ring, max_frequency: 5}"
+    blocks = ROS.replace("{name: /count}", topics).replace("topics:", "all_topics: true, topics:")
+    with running(tmp_path / "robot", blocks) as (recorder, _):
+        wait_until(lambda: raw_messages(recorder.store.path, "/odom"), "messages are recorded")
+        items = recorder.pipeline.items
+    kept = {name: (item.options.keep, item.options.max_frequency) for name, item in items.items()}
+    assert kept == {
+        "ros_cam_a": ("ring", 5), "ros_cam_b": ("bulk", None), "ros_odom": ("all", None),
+    }  # fmt: skip
+    assert recorder.store.journal_files("ring") and recorder.store.journal_files("bulk")
+
+
 def test_events_do_not_put_off_the_next_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -86,9 +86,9 @@ def test_two_recorders_on_one_store(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_folder_without_sources_is_no_recorder(tmp_path: Path) -> None:
-    blocks = "- ethercat:\n    interfaces: []\n"  # a source that is not built yet
+    folder = robot(tmp_path / "robot", "- default_parameters: {max_frequency: 5}\n")
     with pytest.raises(UsageError, match="names no source"):
-        Recorder(load_folder(robot(tmp_path / "robot", blocks)))
+        Recorder(load_folder(folder))
 
 
 def test_a_topic_nobody_publishes_is_a_gap(tmp_path: Path) -> None:

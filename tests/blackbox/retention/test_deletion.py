@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +14,6 @@ from amberbox.blackbox.retention.rule import (
     ages_s,
     for_room,
     too_old,
-    unpinned,
 )
 from amberbox.blackbox.robot_folder.robot_yaml import Lifetime, RetentionOptions
 from amberbox.core.clock import NS
@@ -77,23 +76,6 @@ def test_raw_data_wait_for_columns_that_are_to_outlive_them() -> None:
     keeps_columns = replace(OPTIONS, lifetime=Lifetime(raw_s=60.0))
     assert too_old([waiting], keeps_columns) == []
     assert [r.what for r in too_old([replace(waiting, pending=False)], keeps_columns)] == ["both"]
-
-
-@dataclass(frozen=True)
-class Held:
-    """A pin of one run's range."""
-
-    from_ns: int
-    to_ns: int
-
-    def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
-        return run == 1 and from_ns <= self.to_ns and to_ns >= self.from_ns
-
-
-def test_what_a_pin_meets_stays() -> None:
-    pinned = MIXED[1]
-    held = Held(pinned.end_ns, pinned.end_ns + 1)
-    assert [u.name for u in MIXED if u not in unpinned(MIXED, [held])] == ["main old"]
 
 
 UNITS = st.builds(

@@ -358,6 +358,18 @@ TestBox = BoxMachine.TestCase
 TestBox.settings = settings(
     max_examples=settings().max_examples if SOAKING else 5,
     stateful_step_count=15,
-    deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )
+
+
+@pytest.mark.parametrize("act", [3, 10, 20])
+def test_an_event_whose_journal_is_being_deleted_is_there_once(act: int) -> None:
+    """Its copy is written first; the keeper dies before the journal is gone."""
+    machine = BoxMachine()
+    machine.begin()
+    machine.keeper_dies(act=1)
+    machine.keeper_dies(act=22)
+    machine.change_quota(quota=TIGHT)
+    machine.keeper_dies(act=act)
+    assert list((machine.world.path / "kept").glob("*.mcap"))
+    machine.teardown()

@@ -240,6 +240,7 @@ def test_what_keeps_a_trigger_from_working_is_told_and_others_go_on(tmp_path: Pa
         Trigger("torn", when="ros_count.data >"),
         Trigger("text", when="ros_count.data == 'x'"),
         Trigger("never", when="ros_cuont.data > 3"),
+        Trigger("alarm", when="amberbox_alarm.state == 'open'"),
         Trigger("strange", when="ros_count.dtaa > 3"),
         HIGH,
     )

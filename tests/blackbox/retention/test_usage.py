@@ -24,7 +24,7 @@ def counted(root: Path) -> int:
     return sum(found.values())
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[
+@settings(max_examples=40, suppress_health_check=[
     HealthCheck.function_scoped_fixture])  # fmt: skip
 @given(st.data())
 def test_the_sum_is_right_after_any_change(tmp_path: Path, data: st.DataObject) -> None:

@@ -101,6 +101,32 @@ def test_chosen_topics_only(tmp_path: Path) -> None:
     ]
 
 
+def test_topics_are_chosen_by_pattern_and_type(tmp_path: Path) -> None:
+    path = tmp_path / "one.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="test")
+        kinds = {"/a/x": "sensor_msgs/Image", "/a/y": "std_msgs/Int8", "/b": "std_msgs/Int8"}
+        for name, kind in kinds.items():
+            schema = writer.register_schema(kind, "jsonschema", b"{}")
+            channel = writer.register_channel(name, "json", schema)
+            writer.add_message(channel, START_NS, b"1", START_NS)
+        writer.finish()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+
+    def chosen(*topics: str, **choice: Any) -> list[str]:
+        options = [TopicOptions(name=name) for name in topics]
+        sink = run(Config(path=str(path), speed="max", topics=options, **choice))
+        assert [text for kind, text, _ in sink.events if kind == "topic_missing"] == [
+            f"one.mcap has no topic {name}" for name in topics if name == "/c/*"
+        ]
+        return [topic.name for topic in sink.topics]
+
+    assert chosen("/a/*", "/c/*") == ["/a/x", "/a/y"]
+    assert chosen(exclude=["/a/*"]) == ["/b"]
+    assert chosen(exclude_types=["sensor_msgs/*"]) == ["/a/y", "/b"]
+    assert chosen("/**", types=["sensor_msgs/*"]) == ["/a/x"]
+
+
 def test_a_part_of_it(tmp_path: Path) -> None:
     write_recording(tmp_path / "one.mcap", range(0, 1000, 100))
     config = Config(path=str(tmp_path / "*.mcap"), speed="max", start_s=0.3, duration_s=0.4)

@@ -26,7 +26,8 @@ def test_the_sample_is_accepted() -> None:
     block: Any = yaml.safe_load(SAMPLE)
     config, problems = configure(yaml.safe_dump(block[0]["ros"]))
     assert problems == []
-    assert config is not None and [topic.name for topic in config.topics] == ["/odom", "/scan"]
+    assert config is not None
+    assert [topic.name for topic in config.topics] == ["/odom", "/scan", "/cam/**"]
 
 
 def test_topics_get_their_slash_and_keep_their_options() -> None:
@@ -65,7 +66,7 @@ def test_no_topic_is_fine_when_all_are_wanted() -> None:
 def test_the_environment_completes_the_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_MASTER_URI", "http://robot:11311")
     assert settings(Config(), 900).master_uri == "http://robot:11311/"
-    assert settings(Config("localhost"), 900).master_uri == "http://localhost:11311/"
+    assert settings(Config(ros_master_uri="localhost"), 900).master_uri == "http://localhost:11311/"
     monkeypatch.delenv("ROS_MASTER_URI")
     assert settings(Config(caller_id="box"), 900).caller_id == "/box"
     assert settings(Config(max_message_mb=2), 900).message_limit == 2_000_000

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.blackbox.sources.zmq import Config, ZmqTopic, detect_encoding
+from amberbox.blackbox.payloads.payload import detect_encoding
+from amberbox.blackbox.sources.zmq import Config, ZmqTopic
 from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.yaml_nodes import parse_yaml

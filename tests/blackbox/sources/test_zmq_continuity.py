@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.sources.zmq import Continuity, ZmqTopic
+from amberbox.blackbox.payloads.payload import Continuity
+from amberbox.blackbox.sources.zmq import ZmqTopic
 from tests.fuzzing import examples, fuzz
 
 T = 1_700_000_000
@@ -57,7 +58,7 @@ def test_nothing_is_looked_at_without_being_asked() -> None:
 
 
 @fuzz
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60))
 @given(st.binary(max_size=100), st.sampled_from(["json", "msgpack"]))
 def test_random_payloads_tell_a_number_or_nothing(payload: bytes, encoding: str) -> None:
     for topic in (ZmqTopic("a", sequence="n"), ZmqTopic("a", stamp="n", rate_hz=1e300)):

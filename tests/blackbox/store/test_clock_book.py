@@ -226,7 +226,7 @@ PHASES = st.tuples(STEPS, st.floats(-500e-6, 500e-6), st.sampled_from([True, Fal
                    st.integers(1, 25))  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(phases=st.lists(PHASES, max_size=4), last_s=st.integers(1, 25))
 def test_any_history_is_right_once_it_is_synchronised(
     phases: Sequence[tuple[float, float, bool | None, int]], last_s: int
@@ -241,7 +241,7 @@ def test_any_history_is_right_once_it_is_synchronised(
     assert_right(computer)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(phases=st.lists(PHASES, min_size=1, max_size=4))
 def test_time_never_runs_backwards_and_durations_are_those_of_the_boot_clock(
     phases: Sequence[tuple[float, float, bool | None, int]],

@@ -159,7 +159,7 @@ _DERIVED = ("manifest", "heads.json", IDENTITY, "names.json", "head", "run", "ro
 
 @fuzz
 @settings(
-    max_examples=examples(6), deadline=None,
+    max_examples=examples(6),
     phases=[Phase.generate],  # each takes a second: what fails is short enough as it is
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )  # fmt: skip
@@ -329,7 +329,7 @@ _KINDS = ("segment", "schema", "journal", "confirmed", "incident", "names", "res
 
 @fuzz
 @settings(
-    max_examples=examples(60), deadline=None,
+    max_examples=examples(60),
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )  # fmt: skip
 @given(kind=st.sampled_from(_KINDS), fields=st.dictionaries(st.sampled_from(_KEYS), _GARBAGE))

@@ -7,7 +7,10 @@ from typing import Any
 
 import pytest
 
+from amberbox.blackbox.columns.table_text import plain
+from amberbox.blackbox.journal.tail import read_head
 from amberbox.blackbox.journal.writer import SyncMark
+from amberbox.blackbox.signing.signatures import finished_files
 from amberbox.blackbox.store.derived_journal import (
     SYNC_S,
     DerivedJournal,
@@ -15,14 +18,15 @@ from amberbox.blackbox.store.derived_journal import (
     ItemMessage,
     ReaderProgress,
     SyncThread,
+    event,
     last_progress,
 )
 from amberbox.blackbox.store.journal_reader import journals, run_messages
-from amberbox.blackbox.store.store import create_store
-from amberbox.blackbox.store.tail import follow
+from amberbox.blackbox.store.store import WriterLock, create_store
+from amberbox.blackbox.store.tail import WriterTail, follow
 from amberbox.core.clock import NS, RunClock
-from amberbox.core.types import Batch, Cursor
-from amberbox.testing.clock import ManualClock
+from amberbox.core.types import Batch, Cursor, WriterCursor
+from amberbox.testing.clock import ManualClock, wait_until
 
 
 def rows_of(store: Path, item: str) -> list[dict[str, Any]]:
@@ -108,3 +112,50 @@ def test_what_the_disk_refuses_is_said_at_the_next_write() -> None:
     sync.finish()
     with pytest.raises(OSError, match="worn out"):
         sync.flush_if_due(disk.mark, urgent=True)
+
+
+def test_a_journal_that_is_idle_is_durable_published_and_sealed(tmp_path: Path) -> None:
+    """Its writer appends nothing more, but lives on."""
+    store, clock = create_store(tmp_path / "store"), ManualClock()
+    lock = WriterLock(store, "act")
+    journal = DerivedJournal(store, "act", clock=clock)
+
+    def is_durable() -> bool:
+        journal.keep_up()
+        head = read_head(store.folder("act"))
+        return head is not None and head.durable_seq == head.next_seq
+
+    journal.keep_up()  # nothing was written yet
+    record = EncodedRecord("amberbox/command", b"{}")
+    for _ in range(3):  # the later ones come while the first is being flushed
+        journal.append([record], urgent=True)
+    wait_until(is_durable)
+    assert not list(finished_files(store, {}))
+    clock.advance(599)
+    journal.keep_up()
+    assert not list(finished_files(store, {}))
+    clock.advance(1)
+    journal.keep_up()
+    [path] = finished_files(store, {})
+    before = path.stat().st_size
+    journal.append([record])
+    assert path.stat().st_size == before and list(finished_files(store, {})) == [path]
+    assert len(store.journal_files("act")) == 2
+    journal.close()
+    lock.release()
+
+
+@pytest.mark.parametrize(("writer", "lock"), [("keep", "keeper"), ("watch", "watch")])
+def test_a_follower_gets_what_is_written_after_it_has_read(
+    tmp_path: Path, writer: str, lock: str
+) -> None:
+    store = create_store(tmp_path / "store")
+    held, journal = WriterLock(store, lock), DerivedJournal(store, writer)
+    tail = WriterTail(store, writer, None, WriterCursor(0, 0))
+    for kind in ("first", "second", "third"):
+        journal.write([event(kind, "text")])
+        found = [one for one in tail.step() if isinstance(one, Batch)]
+        columns = [batch.columns["kind"] for batch in found if "kind" in batch.columns]
+        assert [kind for column in columns for kind in plain(column)] == [kind]
+    journal.close()
+    held.release()

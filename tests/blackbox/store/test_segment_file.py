@@ -99,7 +99,7 @@ def columns(draw: st.DrawFn, count: int) -> dict[str, tuple[str, ColumnData]]:
     return made
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, suppress_health_check=list(HealthCheck))
 @given(st.data(), st.integers(1, 12))
 def test_every_value_comes_back(tmp_path: Path, data: st.DataObject, count: int) -> None:
     flat = table(data.draw(columns(count)), count)

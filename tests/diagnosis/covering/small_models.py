@@ -28,7 +28,7 @@ def random_model(rng: random.Random) -> Model:
     signs = tuple(
         Sign(f"s{n}", rng.choice([0.0, 0.01, rng.random()])) for n in range(rng.randint(1, 6))
     )
-    functions = _functions(rng, components)
+    functions = random_functions(rng, components)
     causes = [mode.id for mode in modes] + [function.id for function in functions]
     links = tuple(
         Link(cause, sign.id, rng.choice([0.0, 0.99, 1.0, rng.random()]))
@@ -74,7 +74,7 @@ def _prior(rng: random.Random) -> float:
     return rng.choice([rng.uniform(0.0, 0.5), rng.uniform(0.0, 0.05), 0.5])
 
 
-def _functions(rng: random.Random, components: list[str]) -> tuple[Function, ...]:
+def random_functions(rng: random.Random, components: list[str]) -> tuple[Function, ...]:
     """Make functions over components and earlier functions; some are a component's service."""
     functions: list[Function] = []
     services = rng.random() < 0.5

@@ -140,6 +140,20 @@ def test_what_nothing_known_tells_apart_is_one_group() -> None:
     assert sum(group.probability for group in answer.groups) == pytest.approx(1.0)
 
 
+def test_many_improbable_causes_do_not_come_before_a_probable_one() -> None:
+    few, many = "a#x", [f"b{number}#y" for number in range(12)]
+    modes = (Mode(few, 0.02), *(Mode(name, 0.008) for name in many))
+    links = (
+        Link(few, "s", 0.9),
+        *(Link(name, shown, 0.3) for name in many for shown in ("s", "more")),
+    )
+    model = Model(modes, (Sign("s", 1e-9), Sign("more")), links, unknown=None)
+    answer = diagnose(model, evidence("s", "more"), max_hypotheses=40, mass=1.0)
+    assert answer.hypotheses[0].id == few
+    assert answer.groups[0].members == (few,)
+    assert answer.groups[1].probability > answer.groups[0].probability
+
+
 def test_a_symptom_that_tells_them_apart_splits_the_group() -> None:
     answer = diagnose(alike(), evidence(present="s", absent="t apart"), mass=0.9999)
     assert answer.groups[0].members == ("b#y",)

@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from amberbox.blackbox.robot_folder.folder import load_folder
-from amberbox.blackbox.store.store import open_store
+from amberbox.blackbox.store.store import open_store, submit
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
+from amberbox.core.given_findings import KIND, RecordedFinding
 from amberbox.core.plugins import find
 from amberbox.core.timestamps import format_time
 from amberbox.core.types import Status
@@ -27,15 +29,49 @@ from tests.server.knowledge import robot as server_robot
 
 ROBOT = "ropod_001"
 RULES = "short_circuit(X) :- absent(noisy), component(X), X == motor.\n"
-FINDINGS = (
-    "findings:\n  - {rule: short_circuit(X), maps_to: ['<X>#short'], detects: 0.9, leak: 0.01}\n"
-)
+FLOW = "state_flow.unlikely.ros_speed"
+FINDINGS = f"""\
+findings:
+  - {{rule: short_circuit(X), maps_to: ['<X>#short'], detects: 0.9, leak: 0.01}}
+  - {{finding: {FLOW}, maps_to: ['fan#stuck'], detects: 0.7}}
+"""
+
+EQUATIONS = """\
+kind: equations
+unknowns: []
+known: {speed: ros_speed.data, wanted: ros_speed.data}
+equations:
+  turns: {residual: speed - wanted, component: motor}
+residuals:
+  turns: {equations: [turns], threshold: 1, shown_by: motor/temperature/cool}
+"""
+COMPONENTS = """\
+kind: components
+types:
+  motor:
+    ports: {power: [on, off], speed: [turns, stands]}
+    modes:
+      ok: {nominal: true, constraints: ["power == on and speed == turns or power == off"]}
+      worn: {}
+      short: {}
+  relay:
+    ports: {out: [on, off]}
+    modes: {ok: {nominal: true, constraints: ["out == on"]}}
+components: {motor: motor, relay: relay}
+connections: [[relay.out, motor.power]]
+observe:
+  motor.speed: {value: ros_speed.data > 0, values: {true: turns, false: stands}, max_age: 2}
+"""
+PROVEN = "one of motor#short or motor#worn"
 
 CASES: dict[str, tuple[float, Sequence[str], str]] = {
     "monitors": (2.5, (), "motor/temperature/cool"),
     "conditions": (6.5, (), "noisy"),
     "user": (2.5, ("--symptom", "noisy", "--answer", "sound=smooth"), "noisy"),
     "rules": (2.5, (), "rule:short_circuit(motor)"),
+    "residuals": (2.5, (), "one of motor#short or motor#worn or unknown#other"),
+    "detectors": (10.5, (), FLOW),
+    "consistency": (2.5, (), PROVEN),
     "faulttree": (2.5, ("--engine", "faulttree"), "motor/temperature/cool"),
 }
 """By provider: the time of the diagnosis, its options, and a symptom that results."""
@@ -49,10 +85,13 @@ def start_ns() -> list[int]:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory, start_ns: list[int]) -> Path:
-    """Watch a robot that is well, hot and standing, well, and noisy."""
+    """Watch a robot that is well, hot and standing, well, noisy, and strange to a detector."""
     place = write_folder(tmp_path_factory.mktemp("same") / "robot")
     (place / "fmea.yaml").write_text(FMEA + FINDINGS)
     (place / "robot.yaml").write_text(f"id: {ROBOT}\n")
+    (place / "models").mkdir()
+    (place / "models" / "motor.yaml").write_text(EQUATIONS)
+    (place / "models" / "drive.yaml").write_text(COMPONENTS)
     (place / "rules").mkdir()
     (place / "rules" / "motor.pl").write_text(RULES)
     bench = Bench(place)
@@ -62,6 +101,9 @@ def robot(tmp_path_factory: pytest.TempPathFactory, start_ns: list[int]) -> Path
         bench.run(3, temperature=90, speed=0)
         bench.run(3)
         bench.run(3, speed=200)
+        found = RecordedFinding(FLOW, measured=("ros_speed.data",))
+        submit(open_store(load_folder(place).store_path), KIND, msgspec.to_builtins(found))
+        bench.run(3)
     bench.box.close()
     return place
 

@@ -19,7 +19,7 @@ def chances(tree: FaultTree, events: Sequence[str], **other: float) -> list[floa
     return [{**known, **other}[name] for name in events]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(trees())
 def test_probability_and_cut_sets(tree: FaultTree) -> None:
     events = list(tree.events)
@@ -36,7 +36,7 @@ def test_probability_and_cut_sets(tree: FaultTree) -> None:
     assert not analysis.incomplete and analysis.truncated_at is None
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(trees(COHERENT), st.integers(0, 4))
 def test_an_order_limit_only_leaves_out_what_is_larger(tree: FaultTree, limit: int) -> None:
     analysis = analyse(tree, order_limit=limit)
@@ -51,7 +51,7 @@ def test_an_order_limit_only_leaves_out_what_is_larger(tree: FaultTree, limit: i
     assert analysis.rare_event_sum() == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(trees())
 def test_importance_is_what_conditioning_gives(tree: FaultTree) -> None:
     events = list(tree.events)
@@ -73,7 +73,7 @@ def test_importance_is_what_conditioning_gives(tree: FaultTree) -> None:
         assert found.rrw == pytest.approx(top / without if without else math.inf, rel=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(trees(COHERENT))
 def test_bounds_hold_and_are_what_their_names_say(tree: FaultTree) -> None:
     analysis = analyse(tree)
@@ -87,7 +87,7 @@ def test_bounds_hold_and_are_what_their_names_say(tree: FaultTree) -> None:
         assert analysis.top_probability <= bound + 1e-12 <= sum(each) + 1e-9
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(trees(), st.data())
 def test_the_closest_cut_sets_are_the_most_probable_ones(
     tree: FaultTree, data: st.DataObject

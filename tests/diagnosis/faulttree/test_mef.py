@@ -111,7 +111,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert read(tmp_path, write_mef(tree)) == tree
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(trees())
 def test_any_tree_survives_being_written(
     tmp_path_factory: pytest.TempPathFactory, tree: FaultTree
@@ -321,3 +321,16 @@ def test_what_is_wrong_between_files_names_both(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as caught:
         read_mef(second)
     assert "amberbox faulttree A.xml B.xml" in caught.value.problems[0].hint
+
+
+def test_an_event_tree_is_refused_with_what_to_write_instead(tmp_path: Path) -> None:
+    path = tmp_path / "sequences.xml"
+    path.write_text(GOOD.replace("<opsa-mef>", """<opsa-mef>
+      <define-initiating-event name="fire" event-tree="escape"/>
+      <define-event-tree name="escape"/>""", 1))  # fmt: skip
+    with pytest.raises(ConfigurationError) as caught:
+        read_mef(path)
+    first, second = caught.value.problems
+    assert {first.where, second.where} == {"<define-initiating-event>", "<define-event-tree>"}
+    assert first.what == second.what == "event trees are not supported"
+    assert "write each sequence as a gate" in first.hint and "--effect" in first.hint

@@ -71,7 +71,7 @@ def test_a_tree_without_probabilities_cannot_be_ranked() -> None:
                 None)  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(trees(COHERENT, most_events=8), st.data())
 def test_no_other_cut_set_is_more_probable(tree: FaultTree, data: st.DataObject) -> None:
     analysis = analyse(tree)

@@ -11,7 +11,8 @@ from amberbox.diagnosis.fmea.loader import load_fmea, read_fmea, resolve, vocabu
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs/robot/fmea.md").read_text(encoding="utf-8")
-FILES = [block for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL) if "types:" in block]
+BLOCKS = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+FILES = [block for block in BLOCKS if "functions:" in block]
 
 
 @pytest.mark.parametrize("text", FILES, ids=["one robot", "a team"])

@@ -55,7 +55,7 @@ def fmeas(draw: st.DrawFn) -> Fmea:
     return Fmea("robot", modes, components, functions, {})
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(fmeas())
 def test_trees_say_what_looking_at_every_state_says(fmea: Fmea) -> None:
     modes = list(fmea.modes)
@@ -72,7 +72,7 @@ def test_trees_say_what_looking_at_every_state_says(fmea: Fmea) -> None:
         assert set(found.cut_sets) == minimal_states(states, modes)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(fmeas())
 def test_trees_survive_the_way_through_a_file(
     tmp_path_factory: pytest.TempPathFactory, fmea: Fmea

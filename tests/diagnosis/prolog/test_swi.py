@@ -431,9 +431,7 @@ def _sizes(names: str) -> dict[str, int]:
 QUESTIONS = ["p(X)", "q(X, Y)", "r(X, Y)", "s(X)", "r(a, X)", "s(b)", "r(X, X), \\+ s(X)"]
 
 
-@settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(datalog())
 def test_random_datalog(tmp_path: Path, text: str) -> None:
     need_swipl()

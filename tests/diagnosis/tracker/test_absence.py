@@ -23,10 +23,24 @@ functions:
 """
 
 
-def waits(**onsets_s: float) -> dict[str, float]:
+SHARED = TEXT.replace(
+    "  lamp: {failure_modes:",
+    """\
+  lamp:
+    symptoms:
+      odd: {when: lamp.current > 1, within_s: 4}
+    failure_modes:
+      dim: {probability: 0.01, symptoms: [{symptom: lamp/light/bright, within_s: 30}]}
+      off: {probability: 0.01, symptoms: [lamp/light/on]}
+  torch: {failure_modes:""",
+)
+"""With a share of faults that are not in the file, which alone show that the lamp is odd."""
+
+
+def waits(text: str = TEXT, **onsets_s: float) -> dict[str, float]:
     """Return until when is waited, in seconds; names with ``_`` for ``/``."""
     onsets_ns = {name.replace("_", "/"): round(at * NS) for name, at in onsets_s.items()}
-    found = AbsenceTimes(knowledge(TEXT).fmea).until_ns(onsets_ns)
+    found = AbsenceTimes(knowledge(text).fmea).until_ns(onsets_ns)
     return {name: at_ns / NS for name, at_ns in found.items()}
 
 
@@ -58,3 +72,14 @@ def test_the_newest_symptom_of_a_cause_counts() -> None:
 
 def test_symptoms_that_nothing_causes_make_nobody_wait() -> None:
     assert waits(nobody_knows_this=7) == {}
+
+
+def test_a_fault_that_is_not_in_the_file_has_its_time_too() -> None:
+    assert waits(SHARED, lamp_light_on=100) == {"lamp/light/on": 110}, "the file has no share"
+    shared = f"other: {{share: 0.2}}\n{SHARED}"
+    expected = {"lamp/light/on": 110, "lamp/light/bright": 130, "lamp.odd": 104}
+    assert waits(shared, lamp_light_on=100) == expected
+    assert "lamp/light/bright" not in waits(shared, bus_frames_back=100)
+    assert set(AbsenceTimes(knowledge(shared).fmea).shows) == set(
+        AbsenceTimes(knowledge(SHARED).fmea).shows
+    )

@@ -65,3 +65,21 @@ def test_is_judged_again_after_a_restart() -> None:
     after.resume(before.snapshot())
     after.take(At(4, "bus/devices/all_there").symptom(), seconds(4))
     assert "unit/power/on" in after.onsets(seconds(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"), [("unit/process/running", "absent"), ("unit/power/on", "")]
+)
+def test_an_absence_counts_while_blocked_only_by_itself(name: str, counts: str) -> None:
+    presences = SymptomPresences(KNOWLEDGE.fmea)
+    presences.take(At(2, name, "absent", blocked_by=("bus/devices",)).symptom(), seconds(2))
+    assert presences.counting(seconds(3), {})[name] == counts
+
+
+def test_by_itself_a_symptom_goes_while_its_component_is_blocked() -> None:
+    presences, blocked_by = SymptomPresences(KNOWLEDGE.fmea), ("bus/devices",)
+    presences.take(At(2, "unit/process/running", blocked_by=blocked_by).symptom(), seconds(2))
+    assert "unit/process/running" in presences.onsets(seconds(2))
+    gone = At(4, "unit/process/running", "absent", blocked_by=blocked_by).symptom()
+    presences.take(gone, seconds(4))
+    assert "unit/process/running" not in presences.onsets(seconds(5))

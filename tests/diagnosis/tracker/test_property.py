@@ -92,7 +92,7 @@ def _live(life: Life, cuts: Sequence[int], kept: frozenset[int]) -> list[Symptom
     return out
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(lives, st.lists(ticks, max_size=12), st.lists(ticks, max_size=12), st.data())
 def test_cuts_and_snapshots_change_nothing(
     life: Life, one: list[int], other: list[int], data: st.DataObject
@@ -103,7 +103,7 @@ def test_cuts_and_snapshots_change_nothing(
     assert _live(life, other, kept) == expected
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(lives)
 def test_one_diagnosis_at_a_time_in_order_of_time(life: Life) -> None:
     out = _live(life, [], frozenset())

@@ -236,7 +236,7 @@ def test_readings_that_the_watcher_makes_itself_are_no_tests() -> None:
 
 def test_conditions_of_the_analysis_are_symptoms_too() -> None:
     tracker = begun()
-    assert tracker.items == {"motor"} and tracker.history_s == 6.0
+    assert tracker.items == {"motor", "amberbox_event"} and tracker.history_s == 6.0
     times = [0.1 * i for i in range(1, 100)]
     tracker.feed(rows("motor", times, temperature=[20.0 if at < 5 else 80.0 for at in times]))
     found = run(tracker, WELL, 9)

@@ -36,14 +36,23 @@ Held = dict[Position, tuple[str, int, bytes]]
 
 
 class Watcher:
-    """Writes statuses and events into a store's watch journal, as the watcher does."""
+    """Writes statuses and events into a store's watch journal, as the watcher does.
 
-    def __init__(self, path: Path, robot: str = "r1") -> None:
+    With the writer ``act``, reports of an action, as the command process does.
+    """
+
+    def __init__(self, path: Path, robot: str = "r1", writer: str = "watch") -> None:
         self.store = create_store(path)
         self.robot = robot
-        self.lock = WriterLock(self.store, "watch")
-        self.journal = DerivedJournal(self.store, "watch", robot=robot)
+        self.lock = WriterLock(self.store, writer)
+        self.journal = DerivedJournal(self.store, writer, robot=robot)
         self.count = 0
+
+    def report(self, count: int = 1) -> None:
+        """Write reports of an action, each as long as they get."""
+        text = "x" * 500
+        about = {"robot": self.robot, "state": "report", "id": "0" * 32}
+        self.journal.write([(channels.COMMAND, {**about, "text": text})] * count)
 
     def status(self) -> ChannelValues:
         """Compose the next status."""

@@ -21,7 +21,7 @@ from amberbox.link.command_port import (
     GateReport,
     MintedChallenge,
 )
-from amberbox.link.frames import AbortFrame, LeaseFrame
+from amberbox.link.frames import AbortFrame, ConfirmFrame, LeaseFrame
 
 
 class SimulatedGate:
@@ -123,6 +123,9 @@ class SimulatedGate:
         elif frame.do == "release":
             self.state = LeaseState(self.state.number)
         self.mint()
+
+    def confirm(self, frame: ConfirmFrame) -> None:
+        """Do nothing: no motion waits here."""
 
     def abort(self, frame: AbortFrame) -> None:
         """Note what was aborted."""

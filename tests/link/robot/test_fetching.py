@@ -20,6 +20,7 @@ from amberbox.link.connection import LinkOptions
 from amberbox.link.frames import FetchFrame
 from amberbox.link.policy import CopySituation
 from amberbox.link.uploader import FetchRequests, JournalCopier, UploadReply
+from tests.link.robot.rig import Watcher
 from tests.support.manual_recorder import COUNT, ManualBox, number
 
 RING = Topic("/ring", "ros1", Schema("std_msgs/Int64", "ros1msg", b"int64 data\n"))
@@ -62,6 +63,10 @@ class Scene:
 @pytest.fixture
 def scene(tmp_path: Path) -> Scene:
     return Scene(tmp_path / "store")
+
+
+def refuse(method: str, path: str, headers: dict[str, str], body: object) -> UploadReply:
+    raise AssertionError
 
 
 def test_the_journals_of_a_window_are_named_with_their_size(scene: Scene) -> None:
@@ -125,14 +130,39 @@ def test_a_window_that_is_not_over_goes_on_and_tells_what_comes(scene: Scene) ->
     scene.box.close()
 
 
+def test_journals_that_an_older_server_does_not_know_are_neither_named_nor_copied(
+    scene: Scene,
+) -> None:
+    act = Watcher(scene.store.path, writer="act")
+    act.report()
+    act.close()
+    left_out = frozenset[str]()
+    requests = FetchRequests(
+        scene.store, scene.told.append, act.journal.now_ns, left_out=lambda: left_out
+    )
+    now_ns = act.journal.now_ns()
+    wanted = FetchFrame("one", "", now_ns - 60 * NS, now_ns)
+    requests.add(wanted)
+    requests.step()
+    [name] = requests.journals
+    assert name.startswith("act/")
+    scene.keeper.step(threading.Event())
+    options = LinkOptions("http://127.0.0.1:1", "r1", "k")
+    copier = JournalCopier(scene.store, options, refuse, lambda: CopySituation(left_out=left_out))
+    assert name in copier.waiting()
+    left_out = frozenset({"act"})
+    requests.add(wanted)
+    requests.step()
+    assert not requests.journals and scene.names() == []
+    waiting = copier.waiting()
+    assert waiting and name not in waiting
+
+
 def test_what_was_asked_for_goes_under_any_rule_the_ring_included(scene: Scene) -> None:
     requests = scene.requests()
     requests.add(scene.fetch("one", 24, 26))
     requests.add(scene.fetch("ring", 24, 26, "ros_ring"))
     requests.step()
-
-    def refuse(method: str, path: str, headers: dict[str, str], body: object) -> UploadReply:
-        raise AssertionError
 
     options = LinkOptions("http://127.0.0.1:1", "r1", "k", copy="on_request")
     copier = JournalCopier(

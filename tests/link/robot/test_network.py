@@ -27,8 +27,8 @@ def test_the_default_route_with_the_least_metric_counts() -> None:
 
 def test_what_costs_money_carries_what_cannot_wait() -> None:
     mobile = Network("wwan0")
-    assert allowed_traffic(mobile, ["wwan*"]).lanes == {"urgent", "status"}
-    assert allowed_traffic(mobile, ["wwan*"], statuses=False).lanes == {"urgent"}
+    assert allowed_traffic(mobile, ["wwan*"]).lanes == {"urgent", "command", "status"}
+    assert allowed_traffic(mobile, ["wwan*"], statuses=False).lanes == {"urgent", "command"}
     assert (
         not allowed_traffic(mobile, ["wwan*"]).copies
         and not allowed_traffic(mobile, ["wwan*"]).live

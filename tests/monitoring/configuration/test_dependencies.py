@@ -301,7 +301,7 @@ x: {monitor: ros/knots, restrat: x}
         "'planning'; did you mean 'planner'?",
         "sub/recovery_config.yaml:7: x: unknown key 'restrat'; did you mean 'restart'?",
     ]
-    assert "not carried out" in notes(problems)[0]
+    assert "nothing carries them out by itself" in notes(problems)[0]
     assert component(plan, "ros").recovery_actions == (
         "restart ros.service (systemd) when ros/nodes/planner tells a fault",
     )

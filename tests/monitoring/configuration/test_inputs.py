@@ -113,7 +113,7 @@ def test_a_source_that_records_everything(tmp_path: Path) -> None:
     assert len(errors(problems)) == 1
     _, problems = mode_of(tmp_path, ITEM.format(text="/scan_front"), black_box)
     (error,) = errors(problems)
-    assert error.endswith("; write ros_scan_front, as its block names no topics")
+    assert error.endswith("; write ros_scan_front: its block does not list it")
 
 
 def test_a_star_stands_for_all(tmp_path: Path) -> None:

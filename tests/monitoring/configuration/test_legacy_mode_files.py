@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import create_store
 from amberbox.blackbox.store.tail import follow
 from amberbox.cli.main import main
 from amberbox.core.types import Batch
@@ -266,6 +267,7 @@ def ropod(shared_data: Path, tmp_path: Path) -> Path:
     shutil.copytree(data / "component_configs" / "ropod" / "robot", tmp_path / "components")
     shutil.copy(data / "black_box_configs" / "data_sources.yaml", tmp_path / "black_box.yaml")
     (tmp_path / "robot.yaml").write_text("id: ropod_001\n")
+    create_store(tmp_path / "store").next_run()  # it goes on without its 'event' and 'zyre'
     return tmp_path
 
 

@@ -15,6 +15,7 @@ BLACK_BOX = """\
       - topic: {name: /odom, type: nav_msgs/Odometry, max_frequency: 0.5}
       - topic: {name: /imu, type: sensor_msgs/Imu, change: {absolute: 1, heartbeat_s: 30}}
       - topic: {name: /tf, type: sensor_msgs/Imu, keep: none}
+      - topic: {name: /frames, type: sensor_msgs/Imu, transforms: {heartbeat_s: 40}}
       - topic: {name: /joints, type: geometry_msgs/Twist}
 """
 
@@ -53,6 +54,10 @@ mappings:
          '{condition: "max(input_1 over 5s) < 3"}',
          "looks back over 5 s, but while nothing changes ros_imu keeps one row in 30 s (change)",
          ""),
+        ("expression", "ros_frames.linear_acceleration_x",
+         '{condition: "max(input_1 over 5s) < 3"}',
+         "looks back over 5 s, but while nothing changes ros_frames keeps one row in 40 s "
+         "(transforms)", ""),
         ("range", "ros_imu.linear_acceleration_x", "{max: 3}", "", ""),
     ],
 )  # fmt: skip

@@ -76,7 +76,7 @@ def damaged(draw: st.DrawFn, text: str) -> str:
     return "\n".join(lines)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(damaged(COMPONENT), damaged(RANGE), damaged(DEVICE), damaged("laser: {monitor: a/b}\n"))
 def test_nothing_stops_it(component: str, range_: str, device: str, recovery: str) -> None:
     files = {

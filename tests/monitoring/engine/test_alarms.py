@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import UsageError
+from amberbox.monitoring.alarms import PersonAction
 from amberbox.monitoring.findings import AlarmChange, Finding
 from tests.monitoring.engine.stand import Stand, alarms, at_ns, component, mode, output, seconds
 
@@ -153,7 +154,7 @@ def test_the_severity_is_the_highest_and_rises() -> None:
 
 def test_acknowledged() -> None:
     stand = with_alarm()
-    (told,) = stand.states.command("acknowledge", LASER, "anna", at_ns(5))
+    (told,) = stand.states.command(LASER, PersonAction("acknowledge", "anna", at_ns(5)))
     assert (told.state, told.who, told.live_only, told.changed_ns) == (
         "acknowledged", "anna", True, at_ns(5),
     )  # fmt: skip
@@ -171,7 +172,7 @@ def test_what_gets_worse_is_open_again() -> None:
     stand = well(component("battery", modes=[mode("m", *outputs)]))
     stand.bad(2, "battery/m/low")
     (opened,) = alarms(stand.until(3))
-    stand.states.command("acknowledge", opened.id, "anna", at_ns(4))
+    stand.states.command(opened.id, PersonAction("acknowledge", "anna", at_ns(4)))
     stand.bad(5, "battery/m/empty")
     (worse,) = alarms(stand.until(6))
     assert (worse.state, worse.level, worse.who) == ("open", "error", "")
@@ -180,7 +181,7 @@ def test_what_gets_worse_is_open_again() -> None:
 
 def test_a_new_alarm_is_not_acknowledged() -> None:
     stand = with_alarm()
-    stand.states.command("acknowledge", LASER, "anna", at_ns(3))
+    stand.states.command(LASER, PersonAction("acknowledge", "anna", at_ns(3)))
     stand.ok(4, "laser")
     stand.bad(100, "laser")
     assert [a.state for a in alarms(stand.until(101))] == ["healed", "open"]
@@ -188,7 +189,7 @@ def test_a_new_alarm_is_not_acknowledged() -> None:
 
 def test_shelved_until_it_expires() -> None:
     stand = with_alarm()
-    (told,) = stand.states.command("shelve", LASER, "bo", at_ns(5), at_ns(300))
+    (told,) = stand.states.command(LASER, PersonAction("shelve", "bo", at_ns(5), at_ns(300)))
     assert (told.state, told.who, told.until_ns) == ("shelved", "bo", at_ns(300))
     stand.ok(6, "laser")
     stand.bad(100, "laser")  # another alarm, of what is shelved
@@ -205,15 +206,15 @@ def test_shelved_until_it_expires() -> None:
 
 def test_a_shelf_that_expires_after_it_healed_says_nothing() -> None:
     stand = with_alarm()
-    stand.states.command("shelve", LASER, "bo", at_ns(5), at_ns(10))
+    stand.states.command(LASER, PersonAction("shelve", "bo", at_ns(5), at_ns(10)))
     stand.ok(6, "laser")
     assert [a.state for a in alarms(stand.until(20))] == ["healed"]
 
 
 def test_unshelved() -> None:
     stand = with_alarm()
-    stand.states.command("shelve", LASER, "bo", at_ns(5), at_ns(50))
-    (told,) = stand.states.command("unshelve", LASER, "anna", at_ns(6))
+    stand.states.command(LASER, PersonAction("shelve", "bo", at_ns(5), at_ns(50)))
+    (told,) = stand.states.command(LASER, PersonAction("unshelve", "anna", at_ns(6)))
     assert (told.state, told.who, told.until_ns, told.live_only) == ("open", "anna", None, True)
     assert alarms(stand.until(60)) == []
 
@@ -234,7 +235,7 @@ def test_what_makes_no_sense_is_refused(
     stand = with_alarm()
     until_ns = None if until_s is None else at_ns(until_s)
     with pytest.raises(UsageError, match=what):
-        stand.states.command(action, alarm_id, "anna", at_ns(4), until_ns)
+        stand.states.command(alarm_id, PersonAction(action, "anna", at_ns(4), until_ns))
     assert [a.state for a in stand.states.alarms()] == ["open"]
 
 
@@ -242,12 +243,12 @@ def test_what_people_say_changes_nothing_that_replay_sees() -> None:
     def story(ask: bool) -> list[AlarmChange]:
         stand = with_alarm()
         if ask:
-            stand.states.command("shelve", LASER, "bo", at_ns(5), at_ns(90))
+            stand.states.command(LASER, PersonAction("shelve", "bo", at_ns(5), at_ns(90)))
         stand.ok(6, "laser")
         stand.bad(70, "laser", "loc")
         found = alarms(stand.until(80))
         if ask:
-            stand.states.command("acknowledge", found[-1].id, "anna", at_ns(81))
+            stand.states.command(found[-1].id, PersonAction("acknowledge", "anna", at_ns(81)))
         stand.ok(82, "laser")
         return [a for a in found + alarms(stand.until(200)) if not a.live_only]
 
@@ -257,7 +258,7 @@ def test_what_people_say_changes_nothing_that_replay_sees() -> None:
 
 def test_alarms_go_on_from_a_snapshot() -> None:
     stand = with_alarm()
-    stand.states.command("shelve", LASER, "bo", at_ns(5), at_ns(20))
+    stand.states.command(LASER, PersonAction("shelve", "bo", at_ns(5), at_ns(20)))
     held = json.loads(json.dumps(stand.states.snapshot()))
     again = Stand(*CHAIN, begin=False)
     again.view = stand.view

@@ -77,7 +77,7 @@ def test_what_depends_on_time_changes_without_a_row() -> None:
     assert found == [(0.0, "unknown"), (1.0, "error"), (2.0, "ok")]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     period_ms=st.integers(20, 600), phase_ms=st.integers(0, 1000), place=st.integers(1, 8),
     spare_ms=st.integers(0, 200), word=st.sampled_from(["rate", "max"]),
@@ -315,7 +315,7 @@ def _end_ns(batches: Sequence[Batch]) -> int:
 
 
 @given(records(), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_findings_do_not_depend_on_how_the_record_came(batches: list[Batch], data: Any) -> None:
     """Once as a whole (a replay at full speed), once row by row in random steps (live)."""
     end_ns = _end_ns(batches)
@@ -334,7 +334,7 @@ def test_findings_do_not_depend_on_how_the_record_came(batches: list[Batch], dat
 
 
 @given(records(), st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_snapshot_and_the_last_rows_are_enough_to_go_on(batches: list[Batch], data: Any) -> None:
     end_ns = _end_ns(batches)
     whole = _fed(batches)
@@ -358,7 +358,7 @@ def test_a_snapshot_and_the_last_rows_are_enough_to_go_on(batches: list[Batch], 
 
 
 @given(records())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_nothing_stays_green_when_the_record_goes_silent(batches: list[Batch]) -> None:
     engine = _fed(batches)
     engine.advance(int(batches[-1].log_time_ns[-1]) + 6 * NS)

@@ -47,7 +47,7 @@ def test_a_stall_that_goes_on_is_known_at_once() -> None:
 STALLS = st.lists(st.tuples(st.integers(0, 50), st.integers(1, 50)), max_size=12)
 
 
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(STALLS, st.lists(st.integers(-10, 1200), min_size=2, max_size=6))
 def test_time_within_stalls_is_that_of_a_count_by_hand(
     parts: list[tuple[int, int]], times: list[int]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from amberbox.core.expression import parse
 from amberbox.core.needs import Needs, all_of
 from amberbox.core.types import Status, Symptom
-from amberbox.monitoring.alarms import Action
+from amberbox.monitoring.alarms import Action, PersonAction
 from amberbox.monitoring.findings import TICK_NS, Finding, OutputChange, OutputCondition, Transition
 from amberbox.monitoring.plan import (
     ComponentPlan,
@@ -341,10 +341,10 @@ def _do(states: RobotStates, what: str, now_ns: int) -> list[Finding]:
         return []
     until_ns = now_ns + 41 * TICK_NS if what == "shelve" else None
     action: Action = "shelve" if what == "shelve" else "acknowledge"
-    return list(states.command(action, standing[0].id, "anna", now_ns, until_ns))
+    return list(states.command(standing[0].id, PersonAction(action, "anna", now_ns, until_ns)))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(stories(), st.data())
 def test_it_does_not_matter_how_often_it_is_asked_or_resumed(
     story: Story, data: st.DataObject
@@ -356,7 +356,7 @@ def test_it_does_not_matter_how_often_it_is_asked_or_resumed(
     assert tell(story, cuts, resumes=True) == whole
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(stories())
 def test_what_is_told_holds_together(story: Story) -> None:
     findings = tell(story)

@@ -106,7 +106,7 @@ def levels(record: Sequence[Row], condition: str, cuts: Sequence[int]) -> list[t
 
 
 @fuzz
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(
     record=records(), name=st.sampled_from(FUNCTIONS), window_ms=st.integers(100, 3000),
     limit=st.sampled_from([0.3, 0.7, 3.0, 40.0]), data=st.data(),
@@ -123,7 +123,7 @@ def test_every_window_is_that_of_the_rows(
 
 
 @fuzz
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 @given(record=records(), window_ms=st.integers(100, 3000), data=st.data())
 def test_every_row_is_in_some_window(record: list[Row], window_ms: int, data: Any) -> None:
     whole = [row for row in record if row[0] < (SECONDS - 1) * NS]

@@ -48,6 +48,21 @@ def test_the_worst_of_the_newest_entries_counts() -> None:
     assert judged(BOTH, entry, 2)[:2] == (True, 0)
 
 
+def test_another_number_of_entries_is_an_error() -> None:
+    entry = arrays((0, "laser: rate", 0, ""), (0, "laser: motor", 0, ""), (0, "imu", 0, ""))
+    assert judged(Config(names=("^laser",), count=2), entry, 1)[0] is True
+    found = judged(Config(names=("^laser",), count=3), entry, 1)
+    assert found == (False, 2, "2 entries, 3 expected")
+    assert list(Config(names=("a",), count=0).check())
+
+
+def test_an_entry_may_be_absent() -> None:
+    entry = arrays((0, "laser", 0, "fine"), (4, "imu", 0, "fine"))
+    config = Config(names=("^laser", "^battery"), absent_ok=True)
+    assert judged(config, entry, 1) == (True, 0, "laser: fine")
+    assert judged(config, entry, 8) == (True, 0, "none is there")
+
+
 def test_publishers_send_arrays_of_their_own() -> None:
     entry = arrays((0, "imu", 0, ""), (0.5, "laser", 1, "dirty"), (1, "imu", 0, ""))
     assert judged(BOTH, entry, 1) == (False, 1, "laser: dirty")

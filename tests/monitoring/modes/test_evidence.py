@@ -141,7 +141,7 @@ CASES: Mapping[str, tuple[ModuleType, Any, str, Callable[[Sequence[Row], float, 
 def test_a_verdict_has_the_evidence_for_it(name: str) -> None:
     module, config, result, is_evident = CASES[name]
 
-    @settings(max_examples=examples(25), deadline=None)
+    @settings(max_examples=examples(25))
     @given(rows=streams(), seconds=st.lists(st.integers(0, 64), min_size=1, max_size=8))
     def check(rows: list[Row], seconds: list[int]) -> None:
         instants = [second / 4 for second in sorted(set(seconds))]

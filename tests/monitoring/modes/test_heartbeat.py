@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amberbox.core.mode import FALSE, TRUE, UNKNOWN, Input
+from amberbox.core.mode import FALSE, TRUE, UNKNOWN, Given, Input
 from amberbox.monitoring.modes import heartbeat
 from amberbox.monitoring.modes.heartbeat import Config
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input
@@ -55,6 +55,34 @@ def test_silence_is_a_fault_soon_and_stays_one() -> None:
 def test_a_publisher_that_comes_back() -> None:
     entry = one_input(times_s=[*beats(10, stop_s=5), *beats(10, start_s=8, stop_s=20)])
     assert [alive(TEN, entry, s) for s in (4.9, 7.5, 10.5)] == [TRUE, FALSE, TRUE]
+
+
+def test_inputs_with_rates_of_their_own() -> None:
+    config = Config(rates={"/scan": 10.0, "/map": 0.5}, max_age=1)
+    slow = one_input("/map", times_s=beats(0.5, stop_s=40))
+    found = heartbeat.evaluate(config, [slow], at_s(39, 43, 45))
+    assert found["heard"].tolist() == [TRUE, TRUE, FALSE]
+    half = one_input("/scan", times_s=beats(5, stop_s=40))
+    assert alive(config, half, 30) == FALSE
+    why = heartbeat.reason(config, Given([slow, half], at_s(30)))
+    assert why == "/scan too slow: 5 messages per second, 10 expected"
+    assert heartbeat.history_s(config) == 8
+    assert list(config.check()) == [] and list(Config(rates={"/scan": 0.0}).check())
+    problems = list(heartbeat.input_problems(config, ["/scan", "/mop"]))
+    assert problems == [("rates", "'/map' is no input of this file; did you mean '/mop'?")]
+
+
+def test_a_lost_publisher_is_known_before_silence() -> None:
+    entry = one_input("/scan", times_s=beats(10, stop_s=5))
+    entry.flow.gap_from_ns.extend(np.array([at_s(5)]), np.array([at_s(5)]))
+    config = Config(max_age=5)
+    found = heartbeat.evaluate(config, [entry], at_s(4.9, 6.1))
+    assert (found["connected"].tolist(), found["heard"].tolist()) == ([TRUE, FALSE], [TRUE, TRUE])
+    bad = {"connected": False, "alive": True, "heard": True, "often_enough": True}
+    assert (
+        heartbeat.explain(config, {**bad, "age_s": 1.0, "rate_hz": 9.0})
+        == "no connection to its publisher"
+    )
 
 
 def test_nothing_heard_is_unknown_at_first_and_then_a_fault() -> None:
@@ -112,3 +140,9 @@ def test_silence_and_half_the_rate_are_told_apart() -> None:
 )
 def test_what_cannot_be_measured_is_refused(config: Config, key: str) -> None:
     assert key in [finding[0] for finding in config.check()]
+
+
+def test_the_measure_of_an_item_goes_by_its_own_rate() -> None:
+    config = heartbeat.Config(rates={"ros_imu": 0.5})
+    assert heartbeat.measure(config, "alive", ["`ros_imu`"]) == "age(`ros_imu`) - 6"
+    assert heartbeat.measure(config, "alive", ["`ros_odom`"]) == "age(`ros_odom`) - 2"

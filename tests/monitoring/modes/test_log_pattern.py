@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from amberbox.core.flow import Flow
 from amberbox.core.mode import FALSE, TRUE, UNKNOWN, Input
 from amberbox.monitoring.modes import log_pattern as mode
 from amberbox.monitoring.modes.log_pattern import Config
@@ -63,6 +64,21 @@ def test_a_level_that_is_no_number_does_not_count() -> None:
 def test_before_any_line_nothing_is_known() -> None:
     found = mode.evaluate(Config("x"), [log([])], at_s(0, 1))
     assert found["ok"].tolist() == [UNKNOWN, UNKNOWN]
+
+
+def test_only_lines_of_one_writer_count() -> None:
+    levels = one_input("ros_rosout.level", times_s=range(6), values=[8] * 6)
+    names = one_input(times_s=range(6), values=["/laser", "/laser", "/odom", "/odom", "/odom", ""])
+    config = Config("", level=8, of="/laser")
+    found = mode.evaluate(config, [log(), levels, names], at_s(5))
+    assert (found["lines"], found["last_line"]) == (2, "laser: Timeout")
+
+
+def test_a_log_without_lines_may_be_well() -> None:
+    quiet = Input("log", flow=Flow(began_ns=at_s(0)))
+    assert mode.in_silence(Config("x", silence_ok=True)) and not mode.in_silence(Config("x"))
+    found = mode.evaluate(Config("x", silence_ok=True), [quiet], at_s(0.5, 2))
+    assert found["ok"].tolist() == [UNKNOWN, TRUE]
 
 
 def test_explanations() -> None:

@@ -18,8 +18,8 @@ NONSENSE = "/../ -no such thing- /.."
 def test_the_probes_that_are_promised_are_there() -> None:
     promised = {
         *("path_exists", "usb_device", "network_interface", "unit_active", "process", "container"),
-        *("ros_node", "ros_topic", "ros_master", "ping", "wifi", "disk", "cpu", "memory"),
-        *("temperature", "clock", "http"),
+        *("ros_node", "ros_topic", "ros_master", "ros_service", "ros2_node", "ping", "wifi"),
+        *("disk", "cpu", "memory", "temperature", "clock", "http"),
     }
     assert promised <= set(PLUGINS)
 

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.monitoring.probes.disk import FileSystemMount, judge, measure, mount_of
+from amberbox.core.host import FileSystemMount, mount_of, usage_of_disk
+from amberbox.core.probe import Measured
+from amberbox.monitoring.probes import disk
+from amberbox.monitoring.probes.disk import measure
 
 DATA = FileSystemMount(Path("/data"), read_only=False)
 MOUNTINFO = """\
@@ -19,6 +22,10 @@ MOUNTINFO = """\
 26 22 0:41 / /data2 rw - tmpfs tmpfs rw
 27 22 0:42 / /data2 rw - tmpfs tmpfs ro
 """
+
+
+def judge(found: os.statvfs_result, mount: FileSystemMount) -> Measured:
+    return disk.judge(usage_of_disk(found, mount))
 
 
 def answer(blocks: int, free: int, available: int, files: int = 0) -> os.statvfs_result:

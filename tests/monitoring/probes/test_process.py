@@ -10,14 +10,20 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import psutil
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.probes.process import ProcessUsage, find, judge, measure, usage
+from amberbox.core.host import ProcessUsage, find_processes, usage
+from amberbox.monitoring.probes.process import judge, measure
 from amberbox.testing.clock import wait_until
 
 PROC = Path("/proc")
 Start = Callable[..., "subprocess.Popen[bytes]"]
+
+
+def find(subject: str) -> list[int]:
+    return [process.pid for process in find_processes(subject)]
 
 
 @pytest.fixture
@@ -45,7 +51,7 @@ def test_a_program_is_found_by_its_name_while_it_runs(tmp_path: Path, start: Sta
     shutil.copy2(shutil.which("sleep") or "/bin/sleep", program)
     assert measure("laser_driver_amber")["ok"] is False
     first, second = start(str(program), "60"), start(str(program), "60")
-    wait_until(lambda: len(find(PROC, "laser_driver_amber")) == 2, "both run")
+    wait_until(lambda: len(find("laser_driver_amber")) == 2, "both run")
     found = measure("laser_driver_amber")
     assert (found["ok"], found["count"]) == (True, 2)
     assert 0.1 < found["rss_mb"] < 100
@@ -65,10 +71,10 @@ def test_a_busy_script_is_found_by_its_file_or_command_line(tmp_path: Path, star
     busy = start(*script(tmp_path, "planner_amber.py", "print(1)\nwhile True: pass"))
     assert busy.stdout is not None
     busy.stdout.readline()
-    assert find(PROC, "planner_amber.py") == [busy.pid]
-    assert find(PROC, "*planner_amber.py --name amber_?") == [busy.pid]
-    assert find(PROC, "planner_amber") == []
-    assert find(PROC, "amber_x") == [], "an argument is no name"
+    assert find("planner_amber.py") == [busy.pid]
+    assert find("*planner_amber.py --name amber_?") == [busy.pid]
+    assert find("planner_amber") == []
+    assert find("amber_x") == [], "an argument is no name"
     assert measure("planner_amber.py")["cpu_percent"] > 2
 
 
@@ -77,7 +83,7 @@ def test_a_process_that_is_dead_but_not_buried_does_not_count(start: Start) -> N
     process.send_signal(signal.SIGKILL)
     stat = PROC / str(process.pid) / "stat"
     wait_until(lambda: ") Z " in stat.read_text(), "the process is a zombie")
-    assert usage(PROC, [process.pid]) == {}
+    assert usage([psutil.Process(process.pid)]) == {}
 
 
 def test_what_is_used_is_the_difference_of_two_looks() -> None:
@@ -91,29 +97,57 @@ def test_what_is_used_is_the_difference_of_two_looks() -> None:
     }
 
 
-def test_a_name_with_brackets_and_spaces_is_read(tmp_path: Path) -> None:
-    numbers = " ".join(["S", *["0"] * 10, "150", "50", *["0"] * 8, "1000", "0"])
-    (tmp_path / "7").mkdir()
-    (tmp_path / "7" / "stat").write_text(f"7 (a) Z (b) {numbers}\n")
+@pytest.fixture
+def proc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Yield a ``/proc`` that psutil reads."""
+    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
+    psutil.process_iter.cache_clear()
+    (tmp_path / "stat").write_text("btime 1700000000\n")
+    yield tmp_path
+    psutil.process_iter.cache_clear()
+
+
+def entry(proc: Path, pid: int, name: str) -> None:
+    numbers = " ".join(["S", *["0"] * 10, "150", "50", *["0"] * 4, "3", *["0"] * 40])
+    place = proc / str(pid)
+    place.mkdir()
+    (place / "stat").write_text(f"{pid} ({name}) {numbers}\n")
+    (place / "status").write_text("Threads:\t3\n")
+    (place / "statm").write_text("5000 1000 0 0 0 0 0\n")
+    (place / "cmdline").write_text("")
+
+
+def test_a_name_with_brackets_and_spaces_is_read(proc: Path) -> None:
+    entry(proc, 7, "a) Z (b")
+    (process,) = psutil.process_iter()
     tick, page = os.sysconf("SC_CLK_TCK"), os.sysconf("SC_PAGE_SIZE")
-    assert usage(tmp_path, [7, 8]) == {7: ProcessUsage(200 / tick, page * 1000 / 1e6)}
+    assert usage([process]) == {7: ProcessUsage(200 / tick, page * 1000 / 1e6, 3)}
 
 
-def test_where_others_are_hidden_a_missing_process_is_unknown(tmp_path: Path) -> None:
+def test_where_others_are_hidden_a_missing_process_is_unknown(proc: Path) -> None:
+    entry(proc, os.getpid(), "pytest")
     with pytest.raises(PermissionError, match="hidepid"):
-        find(tmp_path, "laser_driver")
-    (tmp_path / "1").mkdir()
-    assert find(tmp_path, "laser_driver") == []
+        find("laser_driver")
+    entry(proc, 1, "systemd")
+    assert find("laser_driver") == []
 
 
-def test_a_kernel_thread_goes_by_its_own_name(tmp_path: Path) -> None:
+def test_a_kernel_thread_goes_by_its_own_name(proc: Path) -> None:
     for pid, name in ((1, "systemd"), (9, "irq/35-can0")):
-        (tmp_path / str(pid)).mkdir()
-        (tmp_path / str(pid) / "cmdline").write_text("")
-        (tmp_path / str(pid) / "comm").write_text(f"{name}\n")
-    assert find(tmp_path, "irq/35-can0") == [9]
+        entry(proc, pid, name)
+    assert find("irq/35-can0") == [9]
+
+
+@pytest.mark.parametrize("name", ["a_long_name_of_", "a_long_name_of_a_driver"])
+def test_a_name_that_the_kernel_cuts_is_found_both_ways(
+    tmp_path: Path, start: Start, name: str
+) -> None:
+    program = tmp_path / "a_long_name_of_a_driver"
+    shutil.copy2(shutil.which("sleep") or "/bin/sleep", program)
+    process = start(str(program), "60")
+    wait_until(lambda: find(name) == [process.pid], "it is found")
 
 
 def test_no_name_is_refused() -> None:
     with pytest.raises(UsageError, match="no process is named"):
-        find(PROC, " ")
+        measure(" ")

@@ -11,7 +11,7 @@ import pytest
 
 from amberbox.blackbox.sources.ros1.master import RosNoAnswerError
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.probes import ros_master, ros_node, ros_topic
+from amberbox.monitoring.probes import ros_master, ros_node, ros_service, ros_topic
 from amberbox.monitoring.probes._ros import settings_for
 from tests.support.processes import free_port
 from tests.support.ros_network import RosMaster
@@ -50,16 +50,17 @@ def at(name: str, master: RosMaster) -> str:
 def test_a_node_is_ok_while_it_answers(master: RosMaster, knows_pid: bool) -> None:
     node = run_node(knows_pid=knows_pid)
     master.register("/scan", "/laser", uri_of(node))
-    found = {"ok": True, "registered": True, "answers": True}
+    found = {"ok": True, "registered": True, "listens": True, "answers": True}
     assert ros_node.measure(at("/laser", master)) == found
     stop(node)
     dead = ros_node.measure(at("/laser", master))
     assert (dead["ok"], dead["registered"], dead["answers"]) == (False, True, False)
+    assert dead["listens"] is False
     assert "refused" in dead["error"]
 
 
 def test_a_node_that_the_master_does_not_know_is_not_ok(master: RosMaster) -> None:
-    unknown = {"ok": False, "registered": False, "answers": False}
+    unknown = {"ok": False, "registered": False, "listens": False, "answers": False}
     assert ros_node.measure(at("laser", master)) == unknown
 
 
@@ -70,12 +71,19 @@ def test_a_node_that_cannot_be_reached_from_here_is_unknown(master: RosMaster) -
     assert "no-such-host.invalid" in found["error"]
 
 
-def test_a_node_that_accepts_and_says_nothing_is_unknown(master: RosMaster) -> None:
+def test_a_node_that_accepts_and_says_nothing_hangs(master: RosMaster) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         master.register("/scan", "/laser", f"http://127.0.0.1:{silent.getsockname()[1]}/")
         found = ros_node.measure(at("/laser", master))
-    assert found["ok"] is None
+    assert (found["ok"], found["listens"], found["answers"]) == (False, True, False)
     assert "timed out" in found["error"]
+
+
+def test_a_service_that_cannot_be_reached_from_here_is_unknown(master: RosMaster) -> None:
+    master.services["/reset"] = "rosrpc://no-such-host.invalid:4711"
+    found = ros_service.measure(at("/reset", master))
+    assert (found["ok"], found["registered"]) == (None, True)
+    assert "no-such-host.invalid" in found["error"]
 
 
 def test_a_topic_is_ok_while_somebody_publishes_it(master: RosMaster) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import AmberboxError
+from amberbox.core.host import temperatures
 from amberbox.core.probe import Measured
-from amberbox.monitoring.probes.temperature import judge, sensors
+from amberbox.monitoring.probes.temperature import judge
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def files(place: Path, **texts: str) -> None:
 
 
 def look(root: Path, subject: str) -> Measured:
-    return judge(list(sensors(root)), subject)
+    return judge(list(temperatures(root)), subject)
 
 
 @pytest.mark.parametrize(

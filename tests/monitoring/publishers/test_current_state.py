@@ -73,7 +73,7 @@ def test_what_is_watched_no_more_is_left_out(store: Store, watcher: FakeRun) -> 
     assert list(read(store, 3).components) == ["laser"]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(after_s=st.floats(3.01, 1e6))
 def test_nothing_stays_green_when_the_watcher_is_silent(
     tmp_path_factory: pytest.TempPathFactory, after_s: float

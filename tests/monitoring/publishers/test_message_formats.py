@@ -187,5 +187,5 @@ def _only_mode(message: Any) -> Any:
 @pytest.mark.parametrize("name", get_args(Format))
 def test_number_that_is_none_stands_as_null(name: Format) -> None:
     status: Status = replace(OF_DEVICE, outputs={"rate": float("nan")})
-    said = msgspec.json.encode(FORMATS[name]([status], NAMES))
+    said = msgspec.json.encode(FORMATS[name]([COMPONENT, status], NAMES))
     assert b'"rate":null' in said or b'"value":"nan"' in said

@@ -119,7 +119,7 @@ class Noting(StatusPublisher):
         super().__init__(*args, **kwargs)
         self.spoke: list[str] = []
 
-    def _send(self, outlet: Any, statuses: object) -> None:
+    def _send(self, outlet: Any, statuses: object, diagnosis: object) -> None:
         self.spoke.append(outlet.options.topic)
 
 
@@ -178,13 +178,15 @@ def test_address_that_is_taken_is_an_error(url: str) -> None:
 
 def test_documented_entries_are_sound(tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "robot" / "status.md").read_text("utf-8")
-    (shown,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (shown,) = re.findall(r"```yaml\n(monitoring:.*?)```", page, re.DOTALL)
     (tmp_path / "robot.yaml").write_text(f"id: robot\n{shown}")
     (tmp_path / "black_box.yaml").write_text("- zmq: {endpoint: tcp://localhost:5555}\n")
     folder, problems = inspect_folder(tmp_path)
     assert problems == []
     assert folder is not None
-    assert [entry.format for entry in folder.robot.monitoring.publish] == ["paper", "health_status"]
+    assert [entry.format for entry in folder.robot.monitoring.publish] == [
+        "paper", "health_status", "diagnostics", "diagnostics", "mqtt",
+    ]  # fmt: skip
 
 
 def folder_problems(folder: Path, monitoring: str) -> list[str]:
@@ -193,14 +195,18 @@ def folder_problems(folder: Path, monitoring: str) -> list[str]:
     return [str(problem) for problem in inspect_folder(folder)[1]]
 
 
-@pytest.mark.parametrize("url", ["tcp://127.0.0.1:5581", "tcp://localhost:1", "ipc:///run/x"])
+@pytest.mark.parametrize(
+    "url",
+    ["tcp://127.0.0.1:5581", "tcp://localhost:1", "ipc:///run/x", "ros://", "ws://10.0.0.7:8765"],
+)
 def test_what_stays_on_the_computer_is_no_note(tmp_path: Path, url: str) -> None:
-    assert folder_problems(tmp_path, f'{{url: "{url}"}}') == []
+    of_ros = ", format: diagnostics" if url.startswith(("ros", "ws")) else ""
+    assert folder_problems(tmp_path, f'{{url: "{url}"{of_ros}}}') == []
 
 
-@pytest.mark.parametrize("url", ["tcp://*:5581", "tcp://10.0.0.7:5581"])
+@pytest.mark.parametrize("url", ["tcp://*:5581", "tcp://10.0.0.7:5581", "ros://robot:11311"])
 def test_check_notes_what_leaves_the_computer(tmp_path: Path, url: str) -> None:
-    (note,) = folder_problems(tmp_path, f'{{url: "{url}", format: paper}}')
+    (note,) = folder_problems(tmp_path, f'{{url: "{url}", format: diagnostics}}')
     assert f"{tmp_path}/robot.yaml:4: note: monitoring.publish[0].url: '{url}'" in note
     assert "reads the robot's name, its components and their states" in note
 
@@ -214,6 +220,10 @@ def test_check_notes_what_leaves_the_computer(tmp_path: Path, url: str) -> None:
         ("{url: 'tcp://localhost:0'}", "has no port"),
         ("{url: 'tcp://localhost:1', every: 0}", "must be above 0"),
         ("{url: 'tcp://localhost:1', format: papre}", "did you mean 'paper'"),
+        ("{url: 'ros://', format: paper}", "ROS has no type for paper"),
+        ("{url: 'ros://robot:x', format: diagnostics}", "write ros://robot:11311"),
+        ("{url: 'ws://', format: diagnostics}", "is no address"),
+        ("{url: 'ros://', format: diagnostics, topic: diag}", "is not a name ROS allows"),
     ],
 )
 def test_check_refuses_what_cannot_work(tmp_path: Path, entry: str, what: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ class PlainDiagnoser:
         self.items = frozenset({ITEM})
         self.history_s = 0.5
         self.facts: Mapping[str, FaultFacts] = {}
+        self.left_out: Mapping[str, str] = {}
+        self.guarded: frozenset[CodeType] = frozenset()
         self.present: dict[str, None] = {}
         self.last: float | None = None
         self.negative = False

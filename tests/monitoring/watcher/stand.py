@@ -42,7 +42,13 @@ from tests.support.manual_recorder import ManualBox
 
 VALUE = Schema("std_msgs/Float64", "ros1msg", b"float64 data\n")
 NUMBERS = {keep: Topic(f"/{keep}", "ros1", VALUE) for keep in ("main", "bulk", "ring")}
-TOPICS = [TopicOptions("/bulk", keep="bulk"), TopicOptions("/ring", keep="ring")]
+# of a source whose messages may come late, each kept beside one that comes in time
+LATE = {name: Topic(f"/{name}", "ros1", VALUE) for name in ("late", "late_bulk")}
+TOPICS = [
+    TopicOptions("/bulk", keep="bulk"),
+    TopicOptions("/ring", keep="ring"),
+    TopicOptions("/late_bulk", keep="bulk"),
+]
 PROBE = ProbeOrder("path_exists", "/dev/laser")
 GOOD = Result("good", "bool", "it is well")
 
@@ -99,6 +105,15 @@ def plan_of(*more: ComponentPlan, config_hash: str = "hash") -> MonitoringPlan:
     ])  # fmt: skip
 
 
+def late_plan() -> MonitoringPlan:
+    """Return a plan that also looks at what comes late."""
+    back = {"history_s": lambda config: 1.0, "TIMED": True}
+    return plan_of(
+        component("slow", positive, variable("ros_late")),
+        component("slower", steady, variable("ros_late_bulk"), "base", **back),
+    )
+
+
 @dataclass
 class Stand:
     """A store with a recorder that writes random messages, run after run."""
@@ -107,26 +122,50 @@ class Stand:
     seed: int = 0
     clock: ManualClock = field(default_factory=ManualClock)
     diagnoser: MakeDiagnoser | None = None
+    late_s: float = 0.0
+    """How late the messages of the topics in ``LATE`` may come; they have none if it is 0."""
 
     def __post_init__(self) -> None:
         self.random = random.Random(self.seed)
+        self.held_up: list[tuple[Topic, bytes, int]] = []
+        self.late: dict[str, list[int]] = {f"ros_{name}": [] for name in LATE}
+        """Times of receipt of the messages that came late, by item."""
+        self._held_until_ns = 0
         self.box = self._box()
         self.ok = True
 
     def _box(self, rotate_s: float = 600.0) -> ManualBox:
         options = PipelineOptions(boot_id=self.clock.boot_id(), rotate_ns=round(rotate_s * NS))
-        return ManualBox(self.path, TOPICS, clock=self.clock, options=options)
+        return ManualBox(self.path, TOPICS, clock=self.clock, options=options, late_s=self.late_s)
 
     def tick(self) -> None:
         """Receive some messages, or none, and write them."""
         for topic in NUMBERS.values():
             for _ in range(self.random.choice([0, 0, 1, 1, 3])):
                 self.box.hear(topic, struct.pack("<d", self.random.uniform(-1, 3)))
+        if self.late_s:
+            for topic in LATE.values():
+                data = struct.pack("<d", self.random.uniform(-1, 3))
+                self.held_up.append((topic, data, self.box.sink.now_ns()))
+            self._hand_over()
         self.box.write(self.random.choice([0.03, 0.1, 0.1, 0.17]))
+
+    def _hand_over(self) -> None:
+        """Hand over what has come late, unless its source is held up, now and then for long."""
+        if self.clock.boot < self._held_until_ns:
+            return
+        for topic, data, received_ns in self.held_up:
+            self.box.sink.message(self.box.sink.topic(topic), data, received_ns)
+            self.late[f"ros_{topic.name[1:]}"].append(received_ns)
+        self.held_up.clear()
+        self.box.sink.complete(self.box.sink.now_ns())
+        if self.random.random() < 0.1:
+            self._held_until_ns = self.clock.boot + round(self.late_s * 0.9 * NS)
 
     def restart(self, *, clean: bool = True) -> None:
         """End the recorder, and begin another run a moment later."""
         self.box.close() if clean else self.box.crash()
+        self.held_up.clear()
         self.clock.advance(self.random.uniform(0.1, 2))
         self.box = self._box(self.random.choice([1.0, 600.0]))
 

@@ -14,7 +14,8 @@ import pytest
 from amberbox.blackbox.journal.writer import JournalOptions
 from amberbox.blackbox.store.store import REQUESTS, open_store, pending, submit
 from amberbox.core.clock import NS
-from amberbox.core.types import Status
+from amberbox.core.types import Diagnosis, Status
+from amberbox.monitoring.background_sender import SenderEvent
 from amberbox.monitoring.plan import ComponentPlan, MonitoringPlan
 from amberbox.monitoring.watcher import RecordWatcher
 from amberbox.monitoring.watcher_journal import CHANGED, retained_findings
@@ -29,7 +30,7 @@ from tests.monitoring.watcher.stand import (
     variable,
     written,
 )
-from tests.support.manual_recorder import events
+from tests.support.manual_recorder import event_texts, events
 
 
 def only(*parts: ComponentPlan, config_hash: str = "hash") -> MonitoringPlan:
@@ -148,8 +149,14 @@ class Ear:
     def is_due(self) -> bool:
         return True
 
-    def publish(self, statuses: Sequence[Status]) -> None:
+    def publish(self, statuses: Sequence[Status], diagnosis: Diagnosis | None = None) -> None:
         self.heard.append(statuses)
+
+    def changed(self) -> None:
+        pass
+
+    def events(self) -> Sequence[SenderEvent]:
+        return [SenderEvent("publish_connected", "publishes at ros:// /diagnostics")]
 
     def close(self) -> None:
         pass
@@ -169,6 +176,7 @@ def test_old_statuses_are_not_published_as_current(
     watcher = begun(stand, only(base()), 1.0)
     assert levels(stand, watcher, monkeypatch) == {"ok"}
     watcher.close()
+    assert event_texts(stand.path, "publish_connected") == ["publishes at ros:// /diagnostics"]
     stand.box.crash()
     stand.clock.advance(60)
     watcher = stand.watcher(only(base()))

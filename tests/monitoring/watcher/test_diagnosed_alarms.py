@@ -12,6 +12,7 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.types import AmbiguityGroup, Diagnosis, FaultFacts, Hypothesis, Status
 from amberbox.monitoring.alarm_causes import AlarmCauses, DiagnosedAlarms
+from amberbox.monitoring.alarms import PersonAction
 from amberbox.monitoring.findings import AlarmChange, Finding
 from tests.monitoring.watcher.diagnoser import answer
 from tests.monitoring.watcher.test_alarm_causes import alarm
@@ -79,14 +80,14 @@ def test_an_alarm_of_a_monitor_that_comes_later_is_part_of_it() -> None:
     causes, monitor = causes_of(), opens("battery", 30)
     told(causes, HOT, until_s=20)
     (own,) = lasting(causes)
-    changes = causes.command("acknowledge", own[0], "anna", 21 * NS)
+    changes = causes.command(own[0], PersonAction("acknowledge", "anna", 21 * NS))
     assert changes is not None and changes[0].state == "acknowledged"
     assert causes.take(changes[0]).cause == "battery#hot (very likely)"
     assert told(causes, monitor, until_s=60) == []
     (shown,) = causes.named([monitor])
     assert (shown.id, shown.state, shown.who) == (own[0], "acknowledged", "anna")
     with pytest.raises(UsageError, match="is part of"):
-        causes.command("acknowledge", monitor.id, "anna", 61 * NS)
+        causes.command(monitor.id, PersonAction("acknowledge", "anna", 61 * NS))
     assert told(causes, over(HOT, 70), until_s=80)[-1] == ("battery", "open", "")
     assert lasting(causes, monitor) == [(monitor.id, "urgent")], "it lasts by itself"
 

@@ -13,6 +13,7 @@ from amberbox.monitoring.record_reader import RecordBlock, RecordedItemsReader
 from tests.monitoring.watcher.stand import Stand
 
 ITEMS = ("ros_main", "ros_bulk", "ros_ring")
+LATE = ("ros_late", "ros_late_bulk")
 
 
 def lived(stand: Stand, ticks: int) -> Stand:
@@ -26,7 +27,7 @@ def times_of(batches: list[Batch], item: str) -> list[int]:
 
 
 def blocks_of(store: Path) -> list[RecordBlock]:
-    return list(RecordedItemsReader(open_store(store), ITEMS).step())
+    return list(RecordedItemsReader(open_store(store), (*ITEMS, *LATE)).step())
 
 
 def test_a_record_streams_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,13 +44,17 @@ def test_a_record_streams_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert all(time_ns < block.until_ns + 15e9 for time_ns in rows)
 
 
-def test_everything_up_to_a_block_has_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("late_s", [0, 2])
+def test_everything_up_to_a_block_has_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late_s: float
+) -> None:
     monkeypatch.setattr(tail, "BATCH_ROWS", 30)
-    stand = lived(Stand(tmp_path / "store", 3), 200)
+    stand = lived(Stand(tmp_path / "store", 3, late_s=late_s), 200)
     stand.box.close()
     blocks = blocks_of(stand.path)
     given: list[Batch] = []
-    everything = {item: times_of([b for k in blocks for b in k.batches], item) for item in ITEMS}
+    rows = [batch for block in blocks for batch in block.batches]
+    everything = {item: times_of(rows, item) for item in (*ITEMS, *LATE)}
     for block in blocks:
         given += block.batches
         for item, times in everything.items():
@@ -60,6 +65,8 @@ def test_everything_up_to_a_block_has_come(tmp_path: Path, monkeypatch: pytest.M
             ]
     assert [b.until_ns for b in blocks] == sorted({b.until_ns for b in blocks})
     assert len(everything["ros_bulk"]) > 100
+    assert {item: everything[item] for item in LATE} == stand.late
+    assert (len(stand.late["ros_late"]) > 100) == bool(late_s)
 
 
 def test_batch_boundaries_do_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.store.derived_journal import DerivedJournal
-from tests.monitoring.watcher.stand import Stand, written
+from tests.monitoring.watcher.stand import Stand, late_plan, plan_of, written
 
 
 def test_live_and_replay_give_the_same_bytes(tmp_path: Path) -> None:
@@ -27,12 +27,19 @@ def test_live_and_replay_give_the_same_bytes(tmp_path: Path) -> None:
     assert live == stand.replayed()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_killed_at_any_moment_nothing_is_lost_or_doubled(tmp_path: Path, seed: int) -> None:
-    """The recorder restarts, crashes, its clock is set; the watcher is killed amid all this."""
-    stand = Stand(tmp_path / "store", seed)
-    stand.watch_with_kills(120, [-3600, -1.5, 0.3, 2, 3600], killed=0.03, ended=0.02, measured=0.07)
-    live, replayed = written(stand.path), stand.replayed()
+@pytest.mark.parametrize(("seed", "late_s"), [(0, 0), (1, 0), (2, 0), (3, 2), (4, 5)])
+def test_killed_at_any_moment_nothing_is_lost_or_doubled(
+    tmp_path: Path, seed: int, late_s: float
+) -> None:
+    """The recorder restarts, crashes, its clock is set; the watcher is killed amid all this.
+
+    Messages come late, as their source is held up.
+    """
+    stand = Stand(tmp_path / "store", seed, late_s=late_s)
+    plan = late_plan() if late_s else plan_of()
+    jumps_s = [-3600, -1.5, 0.3, 2, 3600]
+    stand.watch_with_kills(120, jumps_s, killed=0.03, ended=0.02, measured=0.07, plan=plan)
+    live, replayed = written(stand.path), stand.replayed(plan)
     assert len(replayed) > 100
     assert live == replayed
 

@@ -21,6 +21,7 @@ from typing import Any
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestFeedback, TestResult
+from actionlib_msgs.msg import GoalID  # type: ignore[import-not-found]  # a package of Debian
 from geometry_msgs.msg import PoseStamped, Twist
 from move_base_msgs.msg import MoveBaseAction, MoveBaseGoal
 from nav_msgs.msg import Path as RosPath
@@ -48,6 +49,10 @@ def on_path(message: Any) -> None:
 
 def on_goal_only(message: Any) -> None:
     note(topic="/goal_only", x=message.target_pose.pose.position.x)
+
+
+def on_cancel(message: Any) -> None:
+    note(cancel=True, id=message.id)
 
 
 def on_set(request: Any) -> Any:
@@ -113,6 +118,7 @@ rospy.init_node("commanded", disable_signals=True)
 rospy.Subscriber("/cmd_vel", Twist, on_twist, queue_size=1000)
 rospy.Subscriber("/path", RosPath, on_path)
 rospy.Subscriber("/goal_only", MoveBaseGoal, on_goal_only)
+rospy.Subscriber("/test/cancel", GoalID, on_cancel)
 for name, kind, handler in (
     ("/trigger", Trigger, on_trigger),
     ("/set", SetBool, on_set),

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
+import xmlrpc.client
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
@@ -14,13 +15,19 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+from rosbags.typesys import Stores, get_typestore
+
+from amberbox.blackbox.journal import channels
 from amberbox.blackbox.query.record import open as open_record
+from amberbox.blackbox.store.own_records import OwnRecords
 from amberbox.blackbox.store.store import is_store, open_store
 from amberbox.cli.main import main
 from amberbox.monitoring.current_state import CurrentStateReader
+from amberbox.monitoring.findings import status_of
+from amberbox.monitoring.publishers.diagnostics import LEVELS
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from tests.support.processes import command
-from tests.support.ros_nodes import Ros, end
+from tests.support.ros_nodes import PYTHON, Ros, end, system_state
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "laser"
 DEVICE, HEARTBEAT = "laser_device_monitor", "laser_heartbeat_monitor"
@@ -79,6 +86,9 @@ def watched(place: Path, uri: str, topic: str) -> Iterator[Laser]:
              f"{{name: {topic}}}")  # fmt: skip
     _replace(laser.folder / "components/laser/heartbeat.yaml", "/scan_front", topic)
     _replace(laser.folder / "components/laser/device.yaml", "/dev/front_laser", str(laser.device))
+    with (laser.folder / "robot.yaml").open("a") as robot:
+        url = uri.replace("http://", "ros://")
+        robot.write(f"monitoring: {{publish: [{{url: '{url}', format: diagnostics}}]}}\n")
     laser.device.touch()
     started = [subprocess.Popen(command("record", str(laser.folder), "--quiet"))]
     wait_until(lambda: is_store(laser.folder / "store"), "a store")
@@ -124,3 +134,46 @@ def test_the_papers_laser(ros: Ros, tmp_path: Path) -> None:
             lambda: drivers.append(ros.robot("--topics", "scan")),
         )
     assert laser.transitions()[-4:] == EXPECTED
+
+
+LISTENER = Path(__file__).with_name("listener.py")
+ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
+
+
+def entries(heard: Path) -> list[tuple[str, str, int, str]]:
+    """Return hardware, name, level and message of all entries that rospy has received."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    lines = heard.read_text().splitlines(keepends=True) if heard.exists() else []
+    found = []
+    for line in (json.loads(line) for line in lines if line.endswith("\n")):
+        assert line["md5"] == types.generate_msgdef(ARRAY)[1]
+        array: Any = types.deserialize_ros1(bytes.fromhex(line["data"]), ARRAY)
+        found += [(s.hardware_id, s.name, s.level, s.message) for s in array.status]
+    return found
+
+
+def test_rospy_hears_the_statuses_as_diagnostics(ros: Ros, tmp_path: Path) -> None:
+    ros.master()
+    ros.robot("--topics", "scan")
+    heard = tmp_path / "heard.jsonl"
+    with watched(tmp_path, ros.uri, "/robot/scan") as laser:
+        ros.processes.start([PYTHON, str(LISTENER), str(heard), "/diagnostics"], ros.port)
+        broken = ("ropod_001", f"laser: {DEVICE}", 2)
+        laser.become(component="ok")
+        wait_until(lambda: [e for e in entries(heard) if e[1:3] == ("laser", 0)], "a level of OK")
+        laser.device.unlink()
+        wait_until(lambda: [e for e in entries(heard) if e[:3] == broken], "the fault")
+        master: Any = xmlrpc.client.ServerProxy(ros.uri)
+        assert dict(master.getTopicTypes("/test")[2])["/diagnostics"] == (
+            "diagnostic_msgs/DiagnosticArray"
+        )
+        laser.become(component="error")
+    journal = {
+        (s.robot, f"{s.component}: {s.mode}" if s.mode else s.component,
+         LEVELS[s.level], s.reason or s.state)
+        for s in (status_of(r.values) for r in OwnRecords(
+            open_store(laser.folder / "store"), "watch", {channels.STATUS}).step())
+    }  # fmt: skip
+    told = {entry for entry in entries(heard) if entry[3] != "not evaluated yet"}
+    assert told and told <= journal
+    assert all(topic != "/diagnostics" for topic, _ in system_state(ros.port)[0])

@@ -39,7 +39,7 @@ POLL_S = 0.25
 def box(ros: Ros, sink: GapSink, *names: str, invisible: bool = False) -> Iterator[None]:
     """Run the source until the block is left."""
     topics = [TopicOptions(name) for name in names or [f"robot/{name}" for name in NAMES]]
-    config = Config(ros.uri, topics, invisible=invisible, poll_s=POLL_S)
+    config = Config(ros_master_uri=ros.uri, topics=topics, invisible=invisible, poll_s=POLL_S)
     stop = threading.Event()
     thread = threading.Thread(target=Source(config, "ros").run, args=(sink, stop))
     thread.start()
@@ -152,7 +152,7 @@ def test_robot_and_master_are_killed_and_return(ros: Ros, invisible: bool) -> No
         ros.master()
         robot = ros.robot()
         wait_for_all(sink, links=4)
-        end(robot)
+        kill_robot(ros, sink, robot)
     assert_right(verdicts(ros, sink, tolerance_s=POLL_S + 0.2 if invisible else 0.2))
     downs = [at for way, _, _, _, at in sink.links if way == "down"]
     assert len(downs) == 4 * len(NAMES)
@@ -252,7 +252,7 @@ def test_a_box_that_hangs_does_not_stop_the_master(ros: Ros) -> None:
         "from amberbox.core.source import TopicOptions\n"
         "from amberbox.testing.contract import MemorySink\n"
         "topics = [TopicOptions(f'robot/{n}') for n in sys.argv[2].split(',')]\n"
-        "config = Config(sys.argv[1], topics, caller_id='hanging')\n"
+        "config = Config(ros_master_uri=sys.argv[1], topics=topics, caller_id='hanging')\n"
         "Source(config, 'ros').run(MemorySink(), threading.Event())\n"
     )
     hanging = ros.processes.start(

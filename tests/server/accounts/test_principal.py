@@ -25,6 +25,8 @@ EXPECTED = """
     data.query      yes    yes      yes        yes    no     robot   read:data
     data.download   no     no       yes        yes    no     robot   read:download
     data.fetch      no     no       yes        yes    no     robot   write:fetch
+    models.read     yes    yes      yes        yes    no     robot   read:data
+    models.write    no     no       yes        yes    no     robot   write:models
     alarms.read     yes    yes      yes        yes    no     robot   read:alarms
     alarms.write    no     yes      yes        yes    no     robot   write:alarms
     incidents.read  yes    yes      yes        yes    no     robot   read:data
@@ -33,6 +35,15 @@ EXPECTED = """
     missions.write  no     yes      yes        yes    no     robot   write:missions
     diagnoses.read  yes    yes      yes        yes    no     robot   read:diagnoses
     diagnoses.write no     yes      yes        yes    no     robot   write:diagnoses
+    commands.read   yes    yes      yes        yes    no     robot   read:commands
+    commands.write  no     no       yes        yes    no     robot   write:commands
+    commands.confirm no    yes      yes        yes    no     robot   write:commands
+    commands.abort  no     yes      yes        yes    no     robot   write:commands
+    keys.write      no     no       yes        yes    no     server  write:commands
+    experiments.read  yes  yes      yes        yes    no     robot   read:experiments
+    experiments.write no   no       yes        yes    no     robot   write:experiments
+    experiments.upload no  no       yes        yes    no     server  write:experiments
+    experiments.step  no   yes      yes        yes    no     robot   step:experiments
     demo.break      yes    yes      yes        yes    no     robot   -
     folder.read     no     no       yes        yes    no     robot   -
     robots.write    no     no       no         yes    no     server  -

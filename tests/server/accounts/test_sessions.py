@@ -276,6 +276,4 @@ def shared() -> Iterator[tuple[ServerDatabase, User]]:
 
 def test_any_order_of_events(shared: tuple[ServerDatabase, User]) -> None:
     Sessions.database, Sessions.user = shared
-    run_state_machine_as_test(
-        Sessions, settings=settings(max_examples=15, stateful_step_count=20, deadline=None)
-    )
+    run_state_machine_as_test(Sessions, settings=settings(max_examples=15, stateful_step_count=20))

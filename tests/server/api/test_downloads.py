@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import hashlib
 import io
-import time
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +23,9 @@ from amberbox.server.schema import AUDIT
 from amberbox.server.settings import write
 from amberbox.server.workers.pool import WorkerPool
 from amberbox.server.workers.protocol import WorkerTask
-from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import T0_NS
 from tests.server.data.filled import ROWS, fill
-from tests.server.house import House, house
+from tests.server.house import House, house, work_until
 
 DOWNLOADS = "/api/v1/downloads"
 _MS = 1_000_000
@@ -43,29 +39,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         yield found
 
 
-def work(home: House, until: Callable[[], bool]) -> None:
-    """Let the server's jobs work until something is so."""
-
-    async def run() -> None:
-        task = asyncio.create_task(home.services.jobs.run())
-        ends = time.monotonic() + PATIENCE_S
-        while not until() and time.monotonic() < ends:
-            await asyncio.sleep(0.02)
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-
-    asyncio.run(run())
-    assert until()
-
-
 def made(home: House, **wanted: Any) -> tuple[dict[str, Any], bytes]:
     """Ask for a download as a technician, have it made, and fetch it."""
     technician = home.client("technician")
     asked = technician.post(DOWNLOADS, json={"robots": ["ropod_001"], **wanted})
     assert asked.status_code == 202, asked.text
     url = f"{DOWNLOADS}/{asked.json()['id']}"
-    work(home, lambda: technician.get(url).json()["state"] not in ("queued", "running"))
+    work_until(
+        home.services.jobs.run,
+        lambda: technician.get(url).json()["state"] not in ("queued", "running"),
+    )
     told = technician.get(url).json()
     return told, technician.get(f"{url}/file").content
 
@@ -198,7 +181,7 @@ def test_one_that_fails_in_a_way_nobody_foresaw_holds_up_no_other(
         def states() -> set[str]:
             return {technician.get(f"{DOWNLOADS}/{one}").json()["state"] for one in asked}
 
-        work(home, lambda: states() == {"failed", "done"})
+        work_until(home.services.jobs.run, lambda: states() == {"failed", "done"})
 
 
 def test_robots_of_other_groups_cannot_be_asked_for(home: House) -> None:
@@ -244,7 +227,10 @@ def test_what_was_begun_is_begun_again(home: House) -> None:
         assert downloads.change(connection, asked["id"], only=["queued"], state="running")
     stray = home.services.folder / "downloads" / "d-000000000000000000000000"
     stray.mkdir(parents=True)
-    work(home, lambda: technician.get(f"{DOWNLOADS}/{asked['id']}").json()["state"] == "done")
+    work_until(
+        home.services.jobs.run,
+        lambda: technician.get(f"{DOWNLOADS}/{asked['id']}").json()["state"] == "done",
+    )
     assert not stray.exists()
 
 
@@ -254,7 +240,7 @@ def test_downloads_go_after_a_day(home: House) -> None:
     try:
         url = f"{DOWNLOADS}/{told['id']}"
         admin = home.client("admin")
-        work(home, lambda: admin.get(url).json()["state"] == "expired")
+        work_until(home.services.jobs.run, lambda: admin.get(url).json()["state"] == "expired")
         assert not (home.services.folder / "downloads" / told["id"] / told["file"]).exists()
     finally:
         home.clock.advance(-25 * 3600)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from amberbox.server.bus import ServerChange
 from amberbox.server.ingest import fetches
 from amberbox.server.schema import UPLOAD
 from amberbox.testing.clock import ManualClock
-from tests.server.house import House, house
+from tests.server.house import House, house, work_until
 
 FETCHES = "/api/v1/robots/ropod_001/fetches"
 WINDOW = {"item": "odom", "from": "2026-09-21T14:00:00Z", "to": "2026-09-21T14:10:00Z"}
@@ -44,23 +43,13 @@ def frames(home: House, monkeypatch: pytest.MonkeyPatch) -> list[ServerFrame]:
 
 def told(home: House, changes: list[ServerChange], until: Callable[[], bool]) -> None:
     """Run the service while it receives changes."""
+    fetches = home.services.fetches
 
-    async def run() -> None:
-        fetches = home.services.fetches
-        task = asyncio.create_task(fetches.run())
-        await asyncio.sleep(0.05)
+    def begun() -> None:
         for change in changes:
             fetches._on_change(change)
-        for _ in range(200):
-            await asyncio.sleep(0.02)
-            if until():
-                break
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
 
-    asyncio.run(run())
-    assert until()
+    work_until(fetches.run, until, begun)
 
 
 def ask(home: House, **wanted: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 import zstandard
 
-from amberbox.link.folders import PACKED_BYTES, address, pack
+from amberbox.link.folders import TAKEN_BYTES, address, pack
 from amberbox.server.schema import AUDIT
 from tests.server.house import House, house
 
@@ -97,7 +97,7 @@ def test_a_bomb_is_refused(home: House) -> None:
 
 
 def test_too_much_is_refused_unread(home: House) -> None:
-    answer = home.robot_client().put(address("ef" * 32), content=bytes(PACKED_BYTES + 1))
+    answer = home.robot_client().put(address("ef" * 32), content=bytes(TAKEN_BYTES + 1))
     assert answer.status_code == 413
 
 

@@ -15,19 +15,27 @@ from starlette.testclient import TestClient
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
+from amberbox.core.contracts import Budget
 from amberbox.core.timestamps import format_time
+from amberbox.diagnosis.faulttree.analysis import analyse
+from amberbox.diagnosis.faulttree.open_psa import write_mef
 from amberbox.link.frames import LinkRow
 from amberbox.monitoring.findings import Finding, encoded, record_of
 from amberbox.server.bus import ServerChange
+from amberbox.server.knowledge import worker
+from amberbox.server.knowledge.questions import AskTrees, encode_question
 from amberbox.server.schema import AUDIT
 from amberbox.server.services import knowledge
 from amberbox.testing.records import FakeRun
+from benchmarks.fault_tree_plants import PlantShape, plant
+from tests.diagnosis.test_models import EVENTS, GATES
 from tests.server.archive.recordings import Robot
 from tests.server.house import House, house
 from tests.server.knowledge import robot as sim
 
 PATH = "/api/v1/robots/ropod_001"
 OLD, OLD_NS = "01d0" * 16, sim.AT_NS - 24 * 3600 * NS
+WITH_TREES = "7ee5" * 16
 RULES = b"""\
 loop(X) :- loop(X).
 nat(0).
@@ -264,6 +272,7 @@ def test_what_it_was_is_kept_with_who_and_when(operator: TestClient) -> None:
     assert operator.post(f"{path}/cause", json=cause).status_code == 201
     (kept,) = operator.get(path).json()["causes"]
     assert (kept["failure_mode"], kept["note"], kept["who"]) == (*cause.values(), "operator")
+    assert operator.post(f"{path}/cause", json={"failure_mode": "none"}).status_code == 201
     other = operator.post(f"{path}/cause", json={"failure_mode": "laser_front#mice"})
     assert "no failure mode 'laser_front#mice'" in what(other)
 
@@ -320,6 +329,46 @@ def test_fault_trees_and_how_close_they_are(operator: TestClient) -> None:
     wrong = operator.get(f"{PATH}/faulttrees", params={"effect": "mov"})
     assert wrong.status_code == 400
     assert what(wrong) == "there is no function 'mov'; did you mean 'move'?"
+
+
+def test_trees_of_several_files_are_what_the_command_line_says(
+    home: House, operator: TestClient, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {"a.xml": GATES, "b.xml": EVENTS}
+    more = {f"models/{name}": text.encode() for name, text in files.items()}
+    sim.hand_in(home, hash_=WITH_TREES, more=more)
+    of = {"config_hash": WITH_TREES}
+    asked: dict[str, Any] = {"effect": "stuck", "cut_sets": 9, "most_probable": 1}
+    found = operator.get(f"{PATH}/faulttrees", params=of | asked).json()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    capsys.readouterr()
+    names = [str(tmp_path / name) for name in files]
+    options = ["--importance", "--cut-sets", "9", "--most-probable", "1", "--json"]
+    assert main(["faulttree", *names, *options]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert {name: found[name] for name in printed if name in found} == {
+        name: value for name, value in printed.items() if name not in ("file", "files")
+    }
+    assert found["description"] == "the arm is stuck"
+    every = operator.get(f"{PATH}/faulttrees", params=of).json()
+    assert {"stuck", "move"} <= {effect["effect"] for effect in every["effects"]}
+
+
+def test_a_tree_that_is_too_large_has_bounds(home: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = plant(PlantShape(12, 3, 2, 2, 8), 3)
+    exact = analyse(tree).top_probability
+    assert exact is not None
+    sim.hand_in(home, "ropod_008", more={"models/plant.xml": write_mef(tree).encode()})
+    sim.state(home, "ropod_008")
+    monkeypatch.setattr(worker, "tree_budget", lambda seconds: Budget(nodes=8_000))
+    question = AskTrees(robot="ropod_008", now_ns=sim.AT_NS, effect="top", seconds=1)
+    one = json.loads(worker.one_tree(home.services.folder, encode_question(question)))["tree"]
+    low, high = one["probability_bounds"]
+    assert one["incomplete"] and low <= exact <= high and low > 0.8 * high
+    best = one["most_probable"]
+    assert len(best["cut_sets"]) == 10 and best["share"][0] > 0.3
+    assert one["closest"][0]["closest"] and one["cut_sets"] == []
 
 
 def test_rules_answer_with_their_proof(operator: TestClient) -> None:

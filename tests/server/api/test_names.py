@@ -14,6 +14,8 @@ OTHERS = {"start", "end", "begin", "stop"}
 """What ends of a stretch of time are not called: they are ``from`` and ``to``."""
 DEADLINES = {"Said", "Shelving"}
 """These have an ``until``: something lasts from now on."""
+MOMENTS = {"MomentNote", "NewMomentNote"}
+"""These are about a moment, ``at``, and may go on ``to`` a later one."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,8 @@ def test_a_stretch_of_time_has_from_and_to(openapi: Mapping[str, Any]) -> None:
     known = dict(fields(openapi))
     for where, names in known.items():
         assert not names & OTHERS, where
-        assert ("from" in names) == ("to" in names), where
+        begins = names & {"from", "at"} if where in MOMENTS else names & {"from"}
+        assert bool(begins) == ("to" in names), where
         assert "until" not in names or where in DEADLINES, where
     assert {"Stretch", "Timeline", "Window", "Consequence", "AlarmRobot", "Mission"} <= {
         where for where, names in known.items() if "from" in names

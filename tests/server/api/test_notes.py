@@ -41,7 +41,8 @@ def notes(home: House, robot: str = ROBOT, **asked: Any) -> list[dict[str, Any]]
 def test_a_note_stands_at_a_moment_without_any_mission(home: House) -> None:
     made = note(home, "the wheel squeaks", at=at(30))
     assert made == {"id": made["id"], "at": at(30), "who": "user:operator",
-                    "text": "the wheel squeaks", "mission": ""}  # fmt: skip
+                    "text": "the wheel squeaks", "mission": "", "note": made["note"], "to": None,
+                    "about": "", "revision": 1}  # fmt: skip
     assert notes(home, **{"from": at(31), "to": at(29)}) == [made]
     assert notes(home, **{"from": at(29)}) == notes(home, to=at(30)) == []
     assert notes(home, "/api/v1/robots/ropod_002") == []
@@ -96,3 +97,31 @@ def test_the_data_page_is_told_of_notes_on_moments_alone(home: House) -> None:
     assert around["notes"] == [made]
     window = {"from": at(13), "to": at(11)}
     assert home.client("viewer").get(path, params=window).json()["notes"] == []
+
+
+def test_a_note_on_a_range_is_found_wherever_the_range_is(home: House) -> None:
+    made = note(home, "wet floor", at=at(60), to=at(50), about="odom.speed")
+    assert made["to"] == at(50) and made["about"] == "odom.speed"
+    assert notes(home, **{"from": at(55), "to": at(54)}) == [made]
+    assert notes(home, **{"from": at(50), "to": at(49)}) == []
+    wrong = home.client("operator").post(
+        f"{ROBOT}/notes", json={"text": "x", "at": at(50), "to": at(60)}
+    )
+    assert wrong.status_code == 400
+
+
+def test_a_note_is_changed_and_withdrawn_and_stays_in_the_audit_log(home: House) -> None:
+    made = note(home, "squeks", at=at(70))
+    path, window = f"{ROBOT}/notes/{made['note']}", {"from": at(71), "to": at(69)}
+    client = home.client("operator")
+    changed = client.post(path, json={"text": "squeaks"}).json()
+    assert changed == {**made, "text": "squeaks", "revision": 2}
+    assert notes(home, **window) == [changed]
+    assert home.client("viewer").post(path, json={"text": "no"}).status_code == 403
+    other = "/api/v1/robots/ropod_002/notes/" + made["note"]
+    assert client.post(other, json={"text": "no"}).status_code == 400
+    assert client.post(f"{path}/withdraw").status_code == 200
+    assert notes(home, **window) == []
+    assert client.post(f"{path}/withdraw").status_code == 400
+    log = home.client("admin").get("/api/v1/audit", params={"action": "notes.withdraw"}).json()
+    assert log[0]["details"]["id"] == made["note"]

@@ -48,12 +48,15 @@ def test_the_defaults_of_every_setting_can_be_sent_back(home: House) -> None:
 
 
 def test_retention_is_replaced_and_read_by_the_archive(home: House) -> None:
-    rules = [{"robot": "ropod_001", "keeping": "ring", "journals_s": 86400}]
+    rules = [
+        {"robot": "ropod_001", "keeping": "ring", "journals_s": 86400},
+        {"robot": "ropod_001", "keeping": "act", "journals_s": 86400},
+    ]
     status, _ = _put(home, "retention", rules)
     assert status == 200
     with home.services.database.reading() as connection:
         found = server_settings.read(connection, "retention", tuple[Retention, ...])
-    assert found == (Retention("ropod_001", "ring", 86400.0),)
+    assert found == tuple(Retention("ropod_001", name, 86400.0) for name in ("ring", "act"))
 
 
 def test_a_change_is_in_the_log_with_what_was_before(home: House) -> None:

@@ -41,14 +41,16 @@ _GB = 1 << 30
 class Scene:
     """A maintained archive, with a disk whose free space the test sets."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, every_s: float = 0.0) -> None:
         folder.mkdir()
         self.clock, self.bus = ManualClock(), EventBus()
         self.database = ServerDatabase(folder / FILE, self.clock)
         self.archive = FolderArchive(folder, self.database, self.clock)
         self.free = 50 * _GB
-        self.keeping = ArchiveMaintenance(folder, self.database, self.bus, self.clock, self.archive,
-                               every_s=0.0, usage=lambda _: (100 * _GB, 0, self.free))  # fmt: skip
+        self.keeping = ArchiveMaintenance(
+            folder, self.database, self.bus, self.clock, self.archive,
+            every_s=every_s, usage=lambda _: (100 * _GB, 0, self.free),
+        )  # fmt: skip
         self.heard: list[ServerChange] = []
         self.bus.on("committed", self.heard.append)
         self.robot = Robot("r1", folder.parent)

@@ -100,6 +100,22 @@ def test_what_the_box_says_goes_only_when_told(archive: FolderArchive, robot: Ro
     assert len(archive.robot("r1").query("odom")) == 120
 
 
+def test_journals_of_commands_go_only_by_a_rule_that_names_them(
+    archive: FolderArchive, tmp_path: Path, clock: ManualClock
+) -> None:
+    robot = Robot("r2", tmp_path)
+    run = FakeRun(robot.store, "act")
+    run.own("amberbox/command", T0_NS, {"state": "done", "id": "7"})
+    run.close()
+    robot.hand_in_all(archive)
+    archive.commit()
+    clock.advance(3 * _DAY_S)
+    assert archive.retain([Retention(journals_s=0.0, columns_s=0.0)]) == 0
+    assert archive.retain([Retention(keeping="act", journals_s=0.0)]) == 1
+    assert journals(archive) == []
+    assert archive.robot("r2").query("amberbox_command", ["state"]).values("state") == ["done"]
+
+
 def test_a_ring_journal_that_a_rule_names_goes(
     archive: FolderArchive, tmp_path: Path, clock: ManualClock
 ) -> None:

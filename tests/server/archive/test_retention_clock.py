@@ -233,7 +233,7 @@ ACTS = st.lists(
 
 
 @fuzz
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=examples(30))
 @given(acts=ACTS)
 def test_whatever_the_clock_does_no_age_is_more_than_the_time_that_passed(
     tmp_path_factory: pytest.TempPathFactory, acts: list[tuple[str, float]]

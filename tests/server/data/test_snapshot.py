@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, insert
 
+from amberbox.blackbox.journal import channels
 from amberbox.blackbox.store.table_reader import RowRequest
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -19,7 +20,7 @@ from amberbox.server.archive.reader import ArchiveReader
 from amberbox.server.data import query as reading
 from amberbox.server.data import snapshot as looking
 from amberbox.server.data.query import RowQuery, rows
-from amberbox.server.data.snapshot import RecordSnapshot, with_snapshot
+from amberbox.server.data.snapshot import RecordSnapshot, SnapshotRecord, with_snapshot
 from amberbox.server.data.worker import described_json, item_json, items_json
 from amberbox.server.database import FILE, ServerDatabase
 from amberbox.server.schema import STATUS
@@ -62,6 +63,38 @@ def test_a_journal_that_is_committed_during_the_look_counts_once(archive: Folder
     archive.commit(0)
     reader = ArchiveReader(layout, catalogue, catalogue.sources(["r1"]))
     assert xs(RecordSnapshot(reader, catalogue, waiting)) == list(range(120))
+
+
+def test_a_record_says_the_same_before_and_after_its_commit(tmp_path: Path) -> None:
+    """A run is judged by its journals as soon as they have come, by the archive later."""
+    archive = FolderArchive(tmp_path / "server", clock=ManualClock())
+    robot = Robot("r1", tmp_path)
+    run = FakeRun(robot.store, items=robot.items)
+    run.start(T0_NS - 1)
+    run.write([(T0_NS + n * 10 * _MS, POSE, pose(n)) for n in range(50)])
+    dropped = {"item": "odom", "peer": "", "from_ns": T0_NS + 20 * _MS, "to_ns": T0_NS + 40 * _MS,
+               "reason": "dropped: the queue is full", "count": 2}  # fmt: skip
+    run.own(channels.GAP, T0_NS + 500 * _MS, dropped)
+    run.close()
+    robot.hand_in_all(archive)
+    span = T0_NS, T0_NS + NS
+    record = SnapshotRecord(archive.layout.folder, archive.catalogue, ("r1",), span=span)
+
+    def answers() -> list[object]:
+        whole, after = record.gaps("odom", *span), record.gaps("odom", T0_NS + 50 * _MS, span[1])
+        values = record.query("odom", ["pose_x"], *span).values("pose_x")
+        names = [info.name for info in record.items()]
+        return [values, [(g.from_ns, g.to_ns, g.reason) for g in whole], after, record.last_ns(),
+                names, record.has_item("odom"), record.variables("odom")]  # fmt: skip
+
+    before = answers()
+    assert before[:3] == [
+        list(range(50)),
+        [(T0_NS + 20 * _MS, T0_NS + 40 * _MS, "dropped: the queue is full")],
+        [],
+    ]
+    archive.commit(0)
+    assert answers() == before
 
 
 def test_what_is_still_on_the_robot_is_said_and_how_to_get_it(archive: FolderArchive) -> None:

@@ -70,9 +70,7 @@ def asked(folder: Path, low: int, high: int, points: int, names: list[str]) -> R
 WINDOWS = st.tuples(st.integers(0, _ROWS - 1), st.integers(1, _ROWS)).map(
     lambda pair: (pair[0], min(pair[0] + pair[1], _ROWS))
 )
-SETTINGS = settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+SETTINGS = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @SETTINGS

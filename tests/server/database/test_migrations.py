@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, Select, inspect
 
+from amberbox.core.notes import RecordedNote
+from amberbox.server import annotations as server_annotations
 from amberbox.server.database import MIGRATIONS, ServerDatabase
 from amberbox.server.derived import from_link
 from amberbox.server.schema import METADATA, ROW
@@ -24,6 +26,11 @@ NEW = {
             ("alarm_roots", "effect words"),
         )
         for column in columns.split()
+    ),
+    4: "DROP INDEX ix_mission_note_robot_uid;"
+    + "".join(
+        f"ALTER TABLE mission_note DROP COLUMN {column};"
+        for column in ("uid", "to_ns", "about", "revision", "withdrawn", "written_ns")
     ),
 }
 """What undoes a migration, so that a database is as old as before it."""
@@ -71,6 +78,20 @@ def test_an_end_before_its_beginning_is_mended(tmp_path: Path) -> None:
     old = made(tmp_path / "old.db")
     with old.reading() as found:
         assert found.exec_driver_sql("SELECT to_ns FROM alarm_consequence").scalar() == 50
+    old.close()
+
+
+def test_older_notes_get_ids(tmp_path: Path) -> None:
+    aged(tmp_path / "old.db")
+    with sqlite3.connect(tmp_path / "old.db") as connection:
+        connection.execute("INSERT INTO mission_note VALUES (7, 'r', '', 50, 'user:bo', 'hi')")
+    old = made(tmp_path / "old.db")
+    with old.begin() as found:
+        stored = server_annotations.find_note(found, "r", "server-7")
+        assert stored is not None
+        assert stored.note == RecordedNote("server-7", 50, "user:bo", "hi")
+        listed = server_annotations.moment_annotations(found, "r", (None, None), None, 9)
+        assert listed == [stored]
     old.close()
 
 

@@ -171,7 +171,7 @@ _ROOM = {
 }
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(trees())
 def test_parts_do_not_overlap(tree: TreeDrawing) -> None:
     """Give every gate and every leaf room of its own, inside the drawing."""
@@ -186,7 +186,7 @@ def test_parts_do_not_overlap(tree: TreeDrawing) -> None:
     assert max(frame.y + frame.height for frame in found) <= block.height + 0.01
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(trees(), some.sets(some.sampled_from([f"e{n}" for n in range(6)])))
 def test_held_agrees_with_the_definition(tree: TreeDrawing, events: set[str]) -> None:
     """Find what holds as a plain recursion does."""

@@ -134,7 +134,7 @@ def test_all_that_is_wrong_is_drawn() -> None:
     assert len(of_class(tree, "node")) == 80
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(some.lists(some.tuples(some.integers(0, 15), some.integers(0, 15)), max_size=30))
 def test_boxes_do_not_overlap(pairs: list[tuple[int, int]]) -> None:
     """Give each card room of its own, inside the drawing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -130,6 +131,35 @@ def test_rows_of_the_link_follow_once(home: House, recorded: Robot) -> None:
     assert [entry.aside for entry in shown][-2:] == ["", "lost_at_power_cut"]
     newest = derived_records(home.services, ROBOT, channels.STATUS, limit=2, newest=True)
     assert [entry.seq for entry in newest] == [31, 40]
+
+
+def test_commands_are_conclusions_like_the_others(home: House, tmp_path: Path) -> None:
+    def command(number: int, state: str) -> dict[str, str]:
+        about = {"id": f"{number:032x}", "text": "why", "person": "anna", "action": "drive",
+                 "parameters": "{}", "risk": "moves", "issuer": "anna", "run": "run-1", "step": "",
+                 "result": ""}  # fmt: skip
+        return {"robot": "ropod_003", "state": state, **about}
+
+    robot = Robot("ropod_003", tmp_path)
+    run = FakeRun(robot.store, writer="act")
+    states = ("ask", "accepted", "report", "done")
+    for number, state in enumerate(states):
+        run.own(channels.COMMAND, T0_NS + number * NS, command(1, state))
+    run.close()
+    robot.hand_in_all(home.services.archive)
+    home.services.archive.commit(0)
+    about = {"robot": "ropod_003", "store_id": robot.store_id, "writer": "act", "run": 1,
+             "channel": channels.COMMAND, "received_ns": 0}  # fmt: skip
+    rows = [
+        {**about, "seq": n, "log_ns": T0_NS + n * NS,
+         "data": msgspec.json.encode(command(2, "refused"))}
+        for n in (1, 50)
+    ]  # fmt: skip
+    with home.services.database.begin() as connection:
+        connection.execute(ROW.insert(), rows)
+    found = derived_records(home.services, "ropod_003", channels.COMMAND)
+    assert [one.values["state"] for one in found] == [*states, "refused"]
+    assert found[0].values == command(1, "ask") and found[0].writer == "act"
 
 
 def test_another_robot_has_concluded_nothing(home: House, recorded: Robot) -> None:

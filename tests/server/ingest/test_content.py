@@ -74,7 +74,7 @@ def test_long_names_and_names_of_other_scripts_from_topics_are_taken(tmp_path: P
 
 @fuzz
 @settings(
-    max_examples=examples(25), deadline=None,
+    max_examples=examples(25),
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )  # fmt: skip
 @given(st.text(st.characters(exclude_categories=["Cs"]), max_size=12) | st.from_regex(r"[./a]+"))

@@ -142,7 +142,7 @@ HOSTILE = st.dictionaries(
 
 @fuzz
 @given(HOSTILE, st.booleans(), st.binary(max_size=40))
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 def test_a_hostile_folder_is_taken_whole_and_masked_or_refused(
     files: dict[str, bytes], cut: bool, rubbish: bytes
 ) -> None:

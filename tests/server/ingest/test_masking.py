@@ -50,14 +50,14 @@ def lines_of_before(text: str) -> str:
 
 @fuzz
 @given(TEXTS)
-@settings(max_examples=examples(400), deadline=None)
+@settings(max_examples=examples(400))
 def test_the_server_masks_what_it_masked(text: str) -> None:
     assert mask_lines(text) == lines_of_before(text)
 
 
 @fuzz
 @given(TEXTS)
-@settings(max_examples=examples(400), deadline=None)
+@settings(max_examples=examples(400))
 def test_a_robot_masks_what_it_masked(text: str) -> None:
     before = ELEMENT.sub(rf"\1{WORD}\2", text)
     assert mask_text(text) == SAID.sub(lambda match: match[1] + mask_quoted(match[2]), before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from amberbox.server.accounts.robots import regroup_robot
 from amberbox.server.accounts.sessions import revoke_sessions
 from amberbox.server.accounts.tokens import add_token
 from amberbox.server.accounts.users import find_user
-from amberbox.server.bus import ServerChange
+from amberbox.server.bus import Kind, ServerChange
 from amberbox.server.derived import RecordStores
 from amberbox.server.http.auth import COOKIE
 from amberbox.server.live import feed as feed_module
@@ -50,6 +51,31 @@ def test_a_snapshot_then_what_changes(home: House) -> None:
             home.services.bus.publish(ServerChange("connected", "ropod_002", {}))
             seen = await hear(socket, "presence")
             assert (seen["robot"], seen["data"]) == ("ropod_002", {"online": True})
+
+    asyncio.run(scene())
+
+
+def test_changes_of_commands_are_for_who_may_see_commands(home: House) -> None:
+    async def scene() -> None:
+        blind = token(home, "technician", "read:status")
+        async with stage(home) as on, on.browser("nurse") as nurse, on.program(blind) as program:
+            for socket in (nurse, program):
+                await ask(socket)
+                await hear(socket, "snapshot")
+            changes: Sequence[Kind] = ("command", "answered", "lease")
+            for number, kind in enumerate(changes):
+                for robot in ("ropod_003", "ropod_001", ""):
+                    home.services.bus.publish(ServerChange(kind, robot, {"ids": [str(number)]}))
+                heard = await hear(nurse, "command")
+                assert (heard["robot"], heard["data"]) == ("ropod_001", {"ids": [str(number)]})
+            on.say("ropod_001", channels.COMMAND, id="0", state="report", text="half way")
+            heard = await hear(nurse, "command")
+            assert (heard["robot"], heard["data"]) == ("ropod_001", {"ids": []})
+            home.services.bus.publish(ServerChange("gone", "ropod_001", {}))
+            kinds: list[str] = []
+            while "presence" not in kinds:
+                kinds += [message["kind"] for message in json.loads(await program.recv())]
+            assert "command" not in kinds
 
     asyncio.run(scene())
 

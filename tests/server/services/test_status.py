@@ -270,7 +270,7 @@ def test_pages_have_the_words_of_the_one_status() -> None:
 )
 @example([("hello", NAMES[1]), ("says", NAMES[1], "error"), ("alarm", NAMES[1], "fatal"),
           ("acknowledged",), ("lost", NAMES[1]), ("time", 30)])  # fmt: skip
-@settings(max_examples=examples(2), deadline=None, phases=PHASES)
+@settings(max_examples=examples(2), phases=PHASES)
 def test_no_two_answers_contradict_each_other(events: Sequence[Event]) -> None:
     with TemporaryDirectory() as folder, house(Path(folder) / "house", shared=True) as home:
         world = World(home)

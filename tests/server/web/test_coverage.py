@@ -45,7 +45,7 @@ def test_what_is_not_here_is_not_recorded() -> None:
     found = stretches(
         [journal(1, 2, "missing"), journal(3, 4, state="refused"),
          journal(5, 6, "unknown", "copying"), journal(7, 8, keeping="keep"),
-         journal(9, 10, "deleted")], [], [], AXIS,
+         journal(7, 8, keeping="act"), journal(9, 10, "deleted")], [], [], AXIS,
     )  # fmt: skip
     assert [(one.kind, one.start // HOUR_NS) for one in found] == [("deleted", 9)]
 

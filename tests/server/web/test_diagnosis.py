@@ -7,18 +7,25 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import pytest
+from msgspec import structs
 from starlette.testclient import TestClient
 
 from amberbox.core.clock import NS
+from amberbox.core.contracts import Budget
 from amberbox.core.types import Diagnosis
-from amberbox.server.knowledge import explanations
+from amberbox.diagnosis.faulttree.open_psa import write_mef
+from amberbox.server.knowledge import explanations, worker
+from amberbox.server.knowledge.questions import AskTrees, encode_question
 from amberbox.server.services import knowledge
+from amberbox.server.web import diagnosis as diagnosispage
 from amberbox.server.web import diagnosis_card as diagnosislook
+from benchmarks.fault_tree_plants import PlantShape, plant
 from tests.server.house import House, house
 from tests.server.knowledge import robot as sim
 
 BASE = "/robots/ropod_001/diagnosis"
 API = f"/api/v1/robots/ropod_001/diagnoses/{sim.DIAGNOSIS}"
+WITH_PLANT = "91a7" * 16
 HOSTILE = '"><img src=x onerror=alert(1)>{{7*7}}'
 
 
@@ -116,6 +123,26 @@ def test_the_tree_is_that_of_what_is_closest_to_being_lost(viewer: TestClient) -
     assert "the rear laser has no power" in text_of(page)
     other = viewer.get(f"{BASE}/tree", params={"effect": "move"}).text
     assert '<option value="move" selected>' in other
+
+
+def test_a_tree_that_is_too_large_shows_its_bounds(
+    home: House, viewer: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = write_mef(plant(PlantShape(12, 3, 2, 2, 8), 3))
+    sim.hand_in(home, hash_=WITH_PLANT, more={"models/plant.xml": text.encode()})
+
+    async def ask(fleet: object, who: object, name: str, asked: AskTrees) -> bytes:
+        changed = structs.replace(asked, config_hash=WITH_PLANT)
+        return worker.one_tree(home.services.folder, encode_question(changed))
+
+    monkeypatch.setattr(diagnosispage, "ask_worker", ask)
+    monkeypatch.setattr(worker, "tree_budget", lambda seconds: Budget(nodes=8_000))
+    page = viewer.get(f"{BASE}/tree", params={"effect": "top"}).text
+    shown = text_of(page)
+    assert '<option value="top" selected>' in page and "<svg" in page
+    assert re.search(r"between \S+e-\d+ and \S+e-\d+", shown)
+    assert "too many to find all of them" in shown
+    assert "These 10 cut sets are" in shown and "What matters most" not in shown
 
 
 def test_a_tree_that_there_is_not_says_so(viewer: TestClient) -> None:
@@ -328,7 +355,7 @@ def test_somebody_answers_and_says_what_it_was(tmp_path_factory: pytest.TempPath
         body = {"test": "laser_front.lamp", "answer": "no"}
         assert client.post(f"{API}/answers", json=body).status_code == 200
         shown = part(client, "")  # at once, without asking a worker again
-        assert "98 %" in shown and "One of these" not in shown
+        assert "97 %" in shown and "One of these" not in shown
         cause = {"failure_mode": "laser_front#silent", "note": HOSTILE}
         assert client.post(f"{API}/cause", json=cause).status_code == 201
         page = client.get(BASE).text

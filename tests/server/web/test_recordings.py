@@ -1,5 +1,6 @@
 """The pages of recordings: their contents by role, and escaping of names."""
 
+import json
 import re
 from collections.abc import Iterator
 from html import unescape
@@ -163,6 +164,10 @@ def test_a_damaged_file_can_be_taken_along(home: House, tmp_path: Path) -> None:
         answer = technician.get(link)
         assert answer.content == b"odd"
         assert answer.headers["content-disposition"].startswith("attachment; filename=")
+        shown = technician.get(f"/recordings/{ROBOT}", headers=HTML).text
+        assert f'data-post="/api/v1/robots/{ROBOT}/recordings/copy"' in shown
+        body = re.search(r'recordings/copy" data-body="([^"]+)"', shown)
+        assert body and json.loads(unescape(body[1]))["journal"] == "journal/odd.mcap"
         assert link not in home.client("viewer").get(f"/recordings/{ROBOT}", headers=HTML).text
         assert home.client("viewer").get(link).status_code == 403
         assert technician.get(link.replace(ROBOT, "ropod_002")).status_code == 404

@@ -6,7 +6,7 @@ import socket
 import struct
 import threading
 import xmlrpc.client
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +15,8 @@ import pytest
 
 from amberbox.blackbox.sources.ros1.client import RosSubscriber
 from amberbox.blackbox.sources.ros1.master import SubscriberSettings
+from amberbox.core.source import TopicOptions
+from amberbox.core.topic_selection import TopicSelection
 from amberbox.core.types import Topic
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from amberbox.testing.contract import MemorySink
@@ -52,9 +54,17 @@ def network() -> Iterator[Network]:
     made.master.stop()
 
 
+def chosen(*names: str, kind: str = "", **choice: Any) -> TopicSelection:
+    return TopicSelection([TopicOptions(name, type=kind) for name in names], **choice)
+
+
+def everything() -> TopicSelection:
+    return chosen(all_topics=True, left_out=["/rosout"])
+
+
 @contextmanager
 def listening(
-    settings: SubscriberSettings, sink: MemorySink, topics: Mapping[str, str] | None = None
+    settings: SubscriberSettings, sink: MemorySink, selection: TopicSelection | None = None
 ) -> Iterator[None]:
     """Run the subscriber in a thread; raise its exceptions."""
     stop = threading.Event()
@@ -62,7 +72,7 @@ def listening(
 
     def run() -> None:
         try:
-            RosSubscriber(settings, {TOPIC: ""} if topics is None else topics, sink).run(stop)
+            RosSubscriber(settings, selection or chosen(TOPIC), sink).run(stop)
         except BaseException as error:
             errors.append(error)
 
@@ -307,7 +317,7 @@ def test_a_connection_that_breaks_is_down_since_it_was_heard_last(network: Netwo
 
 def test_another_type_is_another_stream(network: Network) -> None:
     sink = MemorySink()
-    with listening(network.settings(), sink, {TOPIC: "std_msgs/Int8"}):
+    with listening(network.settings(), sink, chosen(TOPIC, kind="std_msgs/Int8")):
         say(network, sink, b"text").kill()
         wait_for_link(sink, "down")
         say(network, sink, b"12345678", type="a/B", definition="int64 x\n", md5sum="2")
@@ -319,7 +329,7 @@ def test_another_type_is_another_stream(network: Network) -> None:
 def test_a_topic_nobody_publishes_is_an_event(network: Network) -> None:
     network.talker()
     sink = MemorySink()
-    with listening(network.settings(), sink, {"/chta": ""}):
+    with listening(network.settings(), sink, chosen("/chta")):
         text = wait_for_event(sink, "ros_no_publisher")
     assert text == "no publisher of /chta; did you mean '/chat'?; the master knows /chat"
     assert sink.links == []
@@ -362,7 +372,7 @@ def test_a_master_that_hangs_does_not_hold_up_the_end() -> None:
             f"http://127.0.0.1:{silent.getsockname()[1]}/", timeout_s=4 * PATIENCE_S
         )
         thread = threading.Thread(
-            target=RosSubscriber(settings, {TOPIC: ""}, sink).run, args=(stop,)
+            target=RosSubscriber(settings, chosen(TOPIC), sink).run, args=(stop,)
         )
         thread.start()
         connection, _ = silent.accept()
@@ -428,21 +438,71 @@ def test_an_unknown_host_is_an_event_with_a_hint(network: Network) -> None:
 
 def test_all_topics_are_followed_on_request(network: Network) -> None:
     sink = MemorySink()
-    with listening(network.settings(all_topics=True), sink, {}):
+    with listening(network.settings(), sink, everything()):
         network.master.register("/rosout", "/nobody", "http://127.0.0.1:1/")
         say(network, sink, b"hello")
     assert sink.of(TOPIC) == [b"hello"]
     assert "/rosout" not in network.master.subscribers
 
 
-def test_all_topics_are_heard_again_when_box_and_master_have_restarted(network: Network) -> None:
+def test_patterns_find_topics_that_come_later_and_exclusions_are_never_subscribed(
+    network: Network,
+) -> None:
+    sink, selection = MemorySink(), chosen("/cam/*", "/lid/**", exclude=["/cam/raw"])
+    with listening(network.settings(), sink, selection):
+        assert "no publisher of /cam/*" in wait_for_event(sink, "ros_no_publisher")
+        offered = {name: RosTopic() for name in ("/cam/small", "/cam/raw", "/cam/a/b", "/odom")}
+        camera = RosPublisher("/camera", offered, network.master)
+        network.publishers.append(camera)
+        camera.wait_for_subscribers("/cam/small")
+        camera.publish("/cam/small", b"hello")
+        assert sink.wait_for("/cam/small", 1) == [b"hello"]
+        assert set(network.master.subscribers) == {"/cam/small"}
+    assert [topic.name for topic in sink.topics] == ["/cam/small"]
+    assert {request["topic"] for request in camera.requests} == {"/cam/small"}
+
+
+def test_types_choose_before_anything_is_subscribed(network: Network) -> None:
+    image, text = RosTopic("sensor_msgs/Image", "uint8 x\n"), RosTopic()
+    network.publishers.append(RosPublisher("/n", {"/a": image, "/b": text}, network.master))
     sink = MemorySink()
-    with listening(network.settings(all_topics=True), sink, {}):
+    with listening(
+        network.settings(), sink, chosen(all_topics=True, exclude_types=["sensor_msgs/*"])
+    ):
+        network.publishers[0].wait_for_subscribers("/b")
+        # a topic of unknown type is not subscribed until the master knows it
+        network.master.register("/c", "/n", network.publishers[0].uri)
+        network.publishers[0].topics["/c"] = RosTopic()
+        asked = network.master.calls.count("getTopicTypes")
+        wait_until(lambda: network.master.calls.count("getTopicTypes") > asked + 1, "asked again")
+        assert set(network.master.subscribers) == {"/b"}
+        network.master.types["/c"] = "std_msgs/String"
+        network.publishers[0].wait_for_subscribers("/c")
+    assert set(network.master.subscribers) == {"/b", "/c"}
+
+
+def test_the_type_of_a_pattern_is_compared_with_that_of_each_topic(network: Network) -> None:
+    sink = MemorySink()
+    with listening(network.settings(), sink, chosen("/**", kind="std_msgs/msg/Int8")):
+        say(network, sink, b"hello")
+        assert "configured is std_msgs/Int8" in wait_for_event(sink, "ros_type_differs")
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [everything(), chosen("/**", exclude_types=["sensor_msgs/*"])],
+    ids=["all", "types"],
+)
+def test_all_topics_are_heard_again_when_box_and_master_have_restarted(
+    network: Network, selection: TopicSelection
+) -> None:
+    sink = MemorySink()
+    with listening(network.settings(), sink, selection):
         talker = say(network, sink, b"before")
     network.master.publishers.clear()
     talker.topics["/new"] = RosTopic()
     again = MemorySink(saved=sink.saved)
-    with listening(network.settings(all_topics=True), again, {}):
+    with listening(network.settings(), again, selection):
         talker.wait_for_subscribers("/new")
         talker.publish("/new", b"told by the node itself")
         talker.publish(TOPIC, b"after")
@@ -455,13 +515,13 @@ def test_all_topics_are_heard_again_when_box_and_master_have_restarted(network: 
 def test_a_remembered_publisher_that_is_dead_is_a_gap_and_an_event(
     network: Network, all_topics: bool
 ) -> None:
-    sink, topics = MemorySink(), {} if all_topics else {TOPIC: ""}
-    with listening(network.settings(all_topics=all_topics), sink, topics):
+    sink, topics = MemorySink(), everything() if all_topics else chosen(TOPIC)
+    with listening(network.settings(), sink, topics):
         say(network, sink, b"before").kill()
         wait_for_link(sink, "down")
     network.master.publishers.clear()
     again = MemorySink(saved={"publishers": {TOPIC: {NODE: network.publishers[0].uri}}})
-    with listening(network.settings(all_topics=all_topics), again, topics):
+    with listening(network.settings(), again, topics):
         wait_for_event(again, "ros_publisher_silent")
         wait_until(lambda: again.saved["publishers"][TOPIC] == {}, "not for the next run")
         assert len(again.links) == 1
@@ -477,7 +537,7 @@ def test_a_node_that_publishes_a_topic_no_more_is_not_missed(network: Network) -
     talker = network.talker()
     remembered = {"/old": {NODE: talker.uri}, TOPIC: {NODE: talker.uri}}
     sink.saved = {"publishers": remembered}
-    with listening(network.settings(all_topics=True), sink, {}):
+    with listening(network.settings(), sink, everything()):
         wait_until(lambda: sink.saved["publishers"].get("/old") == {}, "forgotten")
         wait_for_link(sink, "up")
     assert [topic for _, topic, *_ in sink.links] == [TOPIC, TOPIC]
@@ -487,7 +547,7 @@ def test_a_publisher_that_cannot_be_reached_is_a_gap_though_another_is_heard(
     network: Network,
 ) -> None:
     sink = MemorySink()
-    with listening(network.settings(all_topics=True), sink, {}):
+    with listening(network.settings(), sink, everything()):
         say(network, sink, b"heard")
         network.master.register(TOPIC, "/far", f"http://127.0.0.1:{free_port()}/")
         wait_for_link(sink, "down")

@@ -79,7 +79,7 @@ def test_an_absurd_length_is_malformed(size: int) -> None:
 
 
 @fuzz
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=examples(30))
 @given(
     st.integers(LARGE_BYTES + 1, LIMIT),
     st.integers(0, 3 * FIRST_BYTES),
@@ -99,7 +99,7 @@ def test_memory_grows_with_what_arrives_whatever_is_announced(
 
 
 @fuzz
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(st.binary(max_size=2000))
 def test_random_bytes_are_messages_or_malformed(data: bytes) -> None:
     framer = Framer(100_000)

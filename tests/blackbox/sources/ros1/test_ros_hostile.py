@@ -106,7 +106,7 @@ def test_addresses_that_are_none_are_no_answer(peer: Peer, address: list[Any]) -
 
 
 @fuzz
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 @given(st.binary(max_size=200))
 def test_random_answers_are_errors_of_ros(peer: Peer, answer: bytes) -> None:
     peer.answer = answer
@@ -120,7 +120,7 @@ def test_random_answers_are_errors_of_ros(peer: Peer, answer: bytes) -> None:
 
 
 @fuzz
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(st.binary(max_size=200))
 def test_random_headers_are_fields_or_malformed(body: bytes) -> None:
     with suppress(TcprosError):

@@ -22,6 +22,8 @@ from amberbox.blackbox.sources.ros1.master import (
 from amberbox.blackbox.sources.ros1.message_type import MessageType, message_type
 from amberbox.blackbox.sources.ros1.node import RosNode, TopicWish
 from amberbox.blackbox.sources.ros1.topic_server import OfferedTopic
+from amberbox.core.source import TopicOptions
+from amberbox.core.topic_selection import TopicSelection
 from amberbox.testing.clock import PATIENCE_S, wait_until
 from amberbox.testing.contract import MemorySink
 from tests.support.ros_network import RosMaster, RosPublisher, RosTopic
@@ -69,7 +71,8 @@ class Heard:
 def test_our_own_listener_records_what_is_published(master: RosMaster) -> None:
     sink, stop = MemorySink(), threading.Event()
     settings = SubscriberSettings(master_uri=master.uri, poll_s=0.05)
-    listening = threading.Thread(target=RosSubscriber(settings, {"/t": ""}, sink).run, args=(stop,))
+    subscriber = RosSubscriber(settings, TopicSelection([TopicOptions("/t")]), sink)
+    listening = threading.Thread(target=subscriber.run, args=(stop,))
     listening.start()
     try:
         with node(master) as publisher:

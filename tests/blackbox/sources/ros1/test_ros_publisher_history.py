@@ -18,7 +18,7 @@ from amberbox.testing.contract import MemorySink
 def test_publishers_are_remembered_across_restarts() -> None:
     sink = MemorySink()
     memory = PublisherHistory(sink)
-    memory.remember("/a", "/n", "http://h:1/")
+    memory.remember("/a", "/n", "http://h:1/", "a/B")
     memory.use_port(4711)
     memory.save()
     again = PublisherHistory(sink)
@@ -30,9 +30,9 @@ def test_publishers_are_remembered_across_restarts() -> None:
 def test_a_node_that_moved_is_remembered_once_and_forgotten_when_it_leaves() -> None:
     sink = MemorySink()
     memory = PublisherHistory(sink)
-    memory.remember("/a", "/n", "http://h:1/")
+    memory.remember("/a", "/n", "http://h:1/", "a/B")
     memory.latch("/a", "/n", "digest")
-    memory.remember("/a", "/n", "http://h:2/")
+    memory.remember("/a", "/n", "http://h:2/", "a/B")
     assert memory.uris("/a") == ["http://h:2/"]
     memory.forget("/a", "http://h:2/")
     memory.save()
@@ -45,7 +45,7 @@ def test_a_node_that_moved_is_remembered_once_and_forgotten_when_it_leaves() -> 
 def test_anonymous_nodes_do_not_pile_up() -> None:
     memory = PublisherHistory(MemorySink())
     for number in range(MOST_PER_TOPIC + 5):
-        memory.remember("/a", f"/n{number}", f"http://h:{number}/")
+        memory.remember("/a", f"/n{number}", f"http://h:{number}/", "a/B")
     uris = memory.uris("/a")
     assert len(uris) == MOST_PER_TOPIC and uris[-1] == f"http://h:{MOST_PER_TOPIC + 4}/"
 
@@ -63,7 +63,7 @@ def test_changes_are_saved_by_a_thread_of_their_own() -> None:
     memory = PublisherHistory(sink)
     thread = threading.Thread(target=memory.keep_saving)
     thread.start()
-    memory.remember("/a", "/n", "http://h:1/")
+    memory.remember("/a", "/n", "http://h:1/", "a/B")
     wait_until(lambda: sink.saved, "saved")
     memory.end_saving()
     thread.join(PATIENCE_S)

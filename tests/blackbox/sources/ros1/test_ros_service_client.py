@@ -212,7 +212,7 @@ def test_a_host_that_does_not_resolve_is_mapped(master: RosMaster, service: Fake
 
 
 @fuzz
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100))
 @given(st.binary(max_size=60))
 def test_random_answers_are_a_response_or_an_error(master: RosMaster, answer: bytes) -> None:
     service = FakeService(master)

@@ -146,7 +146,7 @@ def test_bytes_that_are_no_header(server: TopicServer, data: bytes) -> None:
 
 
 @fuzz
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100))
 @given(st.binary(min_size=1, max_size=200))
 def test_random_bytes_do_no_harm(data: bytes) -> None:
     server = TopicServer("127.0.0.1", "/mouth")

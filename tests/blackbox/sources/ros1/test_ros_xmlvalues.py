@@ -57,7 +57,7 @@ def test_values_nested_too_deep_are_refused() -> None:
 
 
 @fuzz
-@settings(max_examples=examples(50), deadline=None)
+@settings(max_examples=examples(50))
 @given(st.data())
 def test_damaged_answers_are_values_or_errors_that_a_call_expects(data: st.DataObject) -> None:
     whole = xmlrpc.client.dumps((data.draw(values),), methodresponse=True, allow_none=True)

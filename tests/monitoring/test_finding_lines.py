@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from amberbox.cli.watch import FindingLines
 from amberbox.core.clock import NS
 from amberbox.core.types import Status, Symptom
+from amberbox.monitoring.finding_lines import FindingLines
 from tests.monitoring.watcher.diagnoser import answer
 from tests.monitoring.watcher.test_alarm_causes import DEAD, WORDS, alarm
 
