@@ -21,17 +21,26 @@ LOOPBACK = "127.0.0.1"
 _PORTS_GIVEN = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _UNPRIVILEGED = 1_024
 _CHANCE = SystemRandom()  # tests seed the common one, in each worker alike
+_GIVEN: set[int] = set()
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def free_port() -> int:
-    """Return a free TCP port, below those that the system gives to connections meanwhile."""
+    """Return a free TCP port that no other test gets.
+
+    It lies below those that the system gives to connections meanwhile. Workers of one run share
+    the ports by their remainder, and none gets a port twice: who has one may listen late, or again.
+    """
     lowest = int(_PORTS_GIVEN.read_text().split()[0])
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     while True:
         port = _CHANCE.randrange(_UNPRIVILEGED, lowest)
-        with suppress(OSError), socket.create_server((LOOPBACK, port)):
-            return port
+        if port % workers == worker and port not in _GIVEN:
+            with suppress(OSError), socket.create_server((LOOPBACK, port)):
+                _GIVEN.add(port)
+                return port
 
 
 def command(*words: object) -> list[str]:

@@ -180,7 +180,9 @@ class RosPublisher:
 
     def send(self, topic: str, data: bytes) -> None:
         """Send bytes unchanged."""
-        for connection in list(self.topics[topic].connections):
+        with self._changed:
+            connections = list(self.topics[topic].connections)
+        for connection in connections:
             connection.sendall(data)
 
     def wait_for_subscribers(self, topic: str, count: int = 1) -> None:
@@ -229,13 +231,13 @@ class RosPublisher:
         request = _fields(connection.recv(length, socket.MSG_WAITALL))
         self.requests.append(request)
         offered = self.topics[request["topic"]]
-        connection.sendall(encode_header(self._answer(offered)))
-        if offered.error:
-            connection.close()
-            return
-        if offered.last is not None:
-            connection.sendall(_LENGTH.pack(len(offered.last)) + offered.last)
-        with self._changed:
+        with self._changed:  # who has the header gets what is sent from now on
+            connection.sendall(encode_header(self._answer(offered)))
+            if offered.error:
+                connection.close()
+                return
+            if offered.last is not None:
+                connection.sendall(_LENGTH.pack(len(offered.last)) + offered.last)
             offered.connections.append(connection)
             self._changed.notify_all()
 
