@@ -25,7 +25,7 @@ demo: $(ALL)  ## the whole story in the browser: three robots, a button that bre
 	$(BIN)/amberbox demo
 
 test: $(TEST) debian  ## run all tests (PYTEST_ARGS="-k journal")
-	$(BIN)/python -m pytest -m "not alone" -n 3 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not alone" -n 3 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS) || tools/again.sh $$?
 	$(BIN)/python -m pytest -m alone $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 check: lint types rules  ## lint, types, import directions, files, documentation (make -k check: all at once)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -38,6 +41,41 @@ def test_ci_checks_and_tests_and_forbids_skips() -> None:
 def test_scripts_can_be_run(script: Path) -> None:
     assert os.access(script, os.X_OK)
     _run("bash", "-n", str(script))
+
+
+UNSTEADY = """
+from pathlib import Path
+
+def test_unsteady():
+    before = Path("before").exists()
+    Path("before").touch()
+    assert before
+"""
+FAILS = "import pytest\n\n@pytest.mark.parametrize('n', range({}))\ndef test_fails(n): assert {}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "says"),
+    [
+        (UNSTEADY, 0, "unsteady, to be mended: test_planted.py::test_unsteady\n"),
+        (UNSTEADY + FAILS.format(1, False), 1, "1 failed, 1 passed"),
+        (FAILS.format(6, False), 1, ""),
+        (FAILS.format(1, True), 2, ""),
+    ],
+    ids=["unsteady", "one of two fails again", "too many", "the run itself broke"],
+)
+def test_what_failed_runs_once_more(tmp_path: Path, text: str, status: int, says: str) -> None:
+    (tmp_path / "tools").mkdir()
+    again = shutil.copy(ROOT / "tools" / "again.sh", tmp_path / "tools")
+    (tmp_path / "test_planted.py").write_text(text)
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "VENV": sys.prefix}
+    options: dict[str, Any] = {"cwd": tmp_path, "env": environment, "text": True}
+    first = subprocess.run([sys.executable, "-m", "pytest"], capture_output=True, **options)
+    ended = str(first.returncode or 2)  # as if it had been interrupted
+    done = subprocess.run([again, ended], capture_output=True, **options)
+    assert done.returncode == status, done.stderr
+    assert says in done.stdout
+    assert ("again, with nothing beside" in done.stdout) is bool(says)
 
 
 def test_a_python_that_is_too_old_is_refused_with_a_hint(tmp_path: Path) -> None:

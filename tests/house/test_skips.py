@@ -61,14 +61,14 @@ def test_lack_of_recordings_is_counted_and_excused(tmp_path: Path, processes: st
 @PROCESSES
 def test_any_other_skip_fails_the_run_with_its_reason(tmp_path: Path, processes: str) -> None:
     status, output = run(tmp_path, SKIPS, processes=processes)
-    assert status == 1
+    assert status == 6
     assert "test_with_a_peer: no robot here" in output
 
 
 @PROCESSES
 def test_a_skipped_file_fails_the_run_with_its_reason(tmp_path: Path, processes: str) -> None:
     status, output = run(tmp_path, SKIPS_ALL, processes=processes)
-    assert status == 1
+    assert status == 6
     assert "could not import 'no_such_package'" in output
 
 
