@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
@@ -18,7 +18,7 @@ from amberbox.server.accounts.sessions import begin_session
 from amberbox.server.accounts.users import find_user
 from amberbox.server.bus import ServerChange
 from amberbox.server.http.auth import COOKIE
-from amberbox.testing.clock import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S, until
 from tests.server.house import URL, House
 
 
@@ -60,6 +60,10 @@ class Stage:
         """Let a status of a robot arrive."""
         self.say(robot, channels.STATUS, component=component, level=level, **more)
 
+    async def numbered(self) -> None:
+        """Wait until every change so far has its number: those of statuses are gathered first."""
+        await until(lambda: not self.home.services.feed._is_due, "statuses are gathered")
+
 
 @asynccontextmanager
 async def stage(home: House) -> AsyncIterator[Stage]:
@@ -72,7 +76,8 @@ async def stage(home: House) -> AsyncIterator[Stage]:
     try:
         while not server.started:
             await asyncio.sleep(0.005)
-        await asyncio.sleep(0.05)  # the feed has read what it begins with
+        feed, listeners = home.services.feed, home.services.bus._listeners
+        await until(lambda: feed._rows in listeners.get("rows", ()), "the feed listens")
         yield Stage(home, server.servers[0].sockets[0].getsockname()[1])
     finally:
         tasks[0].cancel()
@@ -91,14 +96,22 @@ async def hear(socket: ClientConnection, kind: str) -> dict[str, Any]:
                     return found
 
 
-async def heard_within(socket: ClientConnection, seconds: float) -> list[dict[str, Any]]:
-    """Return all messages received within a time."""
+async def hear_up_to(
+    socket: ClientConnection, is_last: Callable[[dict[str, Any]], bool]
+) -> list[dict[str, Any]]:
+    """Return all messages up to the last one; pings, which fill pauses, are left out."""
     found: list[dict[str, Any]] = []
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            while True:
-                found += json.loads(await socket.recv())
+    async with asyncio.timeout(PATIENCE_S):
+        while not any(map(is_last, found)):
+            found += [m for m in json.loads(await socket.recv()) if m["kind"] != "ping"]
     return found
+
+
+def is_about(component: str, kind: str = "status") -> Callable[[dict[str, Any]], bool]:
+    """Return what knows a message of a kind about a component."""
+    return lambda message: (
+        message["kind"] == kind and any(s["component"] == component for s in message["data"])
+    )
 
 
 async def ask(socket: ClientConnection, **asked: Any) -> None:
