@@ -175,15 +175,16 @@ class RosPublisher:
     def publish(self, topic: str, *messages: bytes) -> None:
         """Send messages to everybody who is connected."""
         offered = self.topics[topic]
-        offered.last = messages[-1] if offered.latching else None
-        self.send(topic, b"".join(_LENGTH.pack(len(m)) + m for m in messages))
+        with self._changed:  # who comes now gets the latched message once
+            offered.last = messages[-1] if offered.latching else None
+            connections = list(offered.connections)
+        _send(connections, b"".join(_LENGTH.pack(len(m)) + m for m in messages))
 
     def send(self, topic: str, data: bytes) -> None:
         """Send bytes unchanged."""
         with self._changed:
             connections = list(self.topics[topic].connections)
-        for connection in connections:
-            connection.sendall(data)
+        _send(connections, data)
 
     def wait_for_subscribers(self, topic: str, count: int = 1) -> None:
         """Wait until so many connections are open; raise TimeoutError."""
@@ -194,12 +195,15 @@ class RosPublisher:
 
     def hang_up(self, topic: str) -> None:
         """Close the connections of a topic."""
-        connections = self.topics[topic].connections
-        while connections:
-            connections.pop().close()
+        with self._changed:
+            connections = self.topics[topic].connections
+            while connections:
+                connections.pop().close()
 
     def kill(self) -> None:
         """Vanish without a word, as after ``kill -9``: the master keeps the registration."""
+        with suppress(OSError):  # else the thread that waits would still let one in
+            self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         _stop(self._api)
         for topic in self.topics:
@@ -224,7 +228,8 @@ class RosPublisher:
         with suppress(OSError):
             while True:
                 connection, _ = self._listener.accept()
-                self._welcome(connection)
+                with suppress(OSError, struct.error):  # it has gone again
+                    self._welcome(connection)
 
     def _welcome(self, connection: socket.socket) -> None:
         length = _LENGTH.unpack(connection.recv(4, socket.MSG_WAITALL))[0]
@@ -251,6 +256,11 @@ class RosPublisher:
             "message_definition": offered.definition,
             "latching": "1" if offered.latching else "0",
         }
+
+
+def _send(connections: Sequence[socket.socket], data: bytes) -> None:
+    for connection in connections:
+        connection.sendall(data)
 
 
 def _fields(body: bytes) -> dict[str, str]:
