@@ -67,7 +67,7 @@ def listening(
     def received(node: str, kind: MessageType, data: bytes) -> None:
         heard.append(data)
 
-    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=1.0)
+    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=20.0)
     with RosNode(settings, soon()) as node:
         yield node.subscribe(TopicWish(topic, kind, received), soon()), heard
 
@@ -93,7 +93,7 @@ def test_large_messages_wait_for_room_too(master: RosMaster) -> None:
         free.wait(PATIENCE_S)
 
     free, target = threading.Event(), RosTarget(master.uri)
-    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=1.0)
+    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=20.0)
     with RosNode(settings, soon()) as node:
         node.subscribe(TopicWish("/name", "std_msgs/String", received), soon())
         with playing(target, NAME):

@@ -65,7 +65,7 @@ def subscribed(master: RosMaster) -> Iterator[list[dict[str, Any]]]:
     def received(node: str, kind: MessageType, data: bytes) -> None:
         heard.append(kind.decode(data))
 
-    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=1.0)
+    settings = NodeSettings(master_uri=master.uri, caller_id="/ear", timeout_s=20.0)
     with RosNode(settings, soon()) as node:
         reader = node.subscribe(TopicWish("/diagnostics", TYPE, received), soon())
         wait_until(lambda: reader.nodes() == {NODE}, "the connection")

@@ -30,6 +30,7 @@ from amberbox.blackbox.sources.ros1.service_client import (
     probe_service,
 )
 from amberbox.blackbox.sources.ros1.tcpros import encode_header, read_exactly, read_header
+from amberbox.testing.clock import PATIENCE_S
 from tests.fuzzing import examples, fuzz
 from tests.support.ros_network import RosMaster
 
@@ -101,7 +102,8 @@ def service(master: RosMaster) -> Iterator[FakeService]:
     made.close()
 
 
-def call(master: RosMaster, name: str = "/set", within_s: float = 10.0, **more: Any) -> Any:
+def call(master: RosMaster, name: str = "/set", within_s: float = PATIENCE_S, **more: Any) -> Any:
+    more = {"timeout_s": PATIENCE_S, **more}
     settings = NodeSettings(master_uri=master.uri, caller_id="/caller", **more)
     request = SET.request.encode({"data": True})
     return call_service(name, SET, request, settings, Deadline.within(within_s))
@@ -116,12 +118,12 @@ def test_a_call(master: RosMaster, service: FakeService) -> None:
 
 def test_a_probe_calls_nothing(master: RosMaster, service: FakeService) -> None:
     settings = NodeSettings(master_uri=master.uri, caller_id="/caller")
-    info = probe_service("/set", settings, Deadline.within(10))
+    info = probe_service("/set", settings, Deadline.within(PATIENCE_S))
     assert info == ServiceInfo("/s", SET.name, SET.md5sum)
     assert service.requests == []
     service.header = encode_header({"callerid": "/s"})
     with pytest.raises(TcprosError, match="without md5sum"):
-        probe_service("/set", settings, Deadline.within(10))
+        probe_service("/set", settings, Deadline.within(PATIENCE_S))
 
 
 @pytest.mark.parametrize(
@@ -156,8 +158,6 @@ def test_answers_that_are_no_success(
         (encode_header({"callerid": "/s"}), "without md5sum"),
         (struct.pack("<I", 0xFFFFFFFF), "connection header of 4294967295 bytes"),
         (struct.pack("<II", 8, 100) + b"abcd", "field without name or end"),
-        (b"", "not answer in time|no connection header"),
-        (struct.pack("<I", 100) + b"x", "not answer in time|no connection header"),
     ],
 )
 def test_headers_that_are_refused(
@@ -165,6 +165,13 @@ def test_headers_that_are_refused(
 ) -> None:
     service.header = header
     with pytest.raises(RosError, match=what):
+        call(master)
+
+
+@pytest.mark.parametrize("header", [b"", struct.pack("<I", 100) + b"x"])
+def test_headers_that_do_not_end(master: RosMaster, service: FakeService, header: bytes) -> None:
+    service.header = header
+    with pytest.raises(RosError, match="not answer in time|no connection header"):
         call(master, within_s=0.5)
 
 
@@ -176,7 +183,7 @@ def test_a_service_that_does_not_end_is_given_up(
     began_s = time.monotonic()
     with pytest.raises(RosNoAnswerError):
         call(master, within_s=0.3)
-    assert time.monotonic() - began_s < 3
+    assert time.monotonic() - began_s < 20
 
 
 def test_a_call_can_be_stopped(master: RosMaster, service: FakeService) -> None:
@@ -192,7 +199,7 @@ def test_a_call_can_be_stopped(master: RosMaster, service: FakeService) -> None:
     settings = NodeSettings(master_uri=master.uri, caller_id="/caller")
     with pytest.raises(RosStoppedError):
         call_service("/set", SET, b"\1", settings, Deadline.within(60, stop.is_set))
-    assert ended.wait(10), "the connection has been closed"
+    assert ended.wait(PATIENCE_S), "the connection has been closed"
 
 
 def test_a_service_that_is_not_there(master: RosMaster) -> None:
