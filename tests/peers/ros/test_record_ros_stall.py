@@ -69,7 +69,7 @@ def test_a_publisher_without_a_queue_is_not_slowed_by_a_stalling_disk(
     counters = last_counters(folder / "store")[ITEM]
     assert len(sent) > 3 * RATE_HZ, "the robot was too slow to prove anything"
     (slowest_s,) = (entry["slowest_s"] for entry in truth if entry["k"] == "end")
-    assert slowest_s < STALL_S / 5
+    assert slowest_s < STALL_S / 2
     assert counters["received"] == len(sent)
     assert [body for body in sent if body in recorded] == kept
     assert counters["dropped"] == len(sent) - len(kept)
