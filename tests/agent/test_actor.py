@@ -27,6 +27,8 @@ DRIVE = """\
 drive:
   kind: zmq_request
   endpoint: ENDPOINT
+  connect_within: 60 s
+  answer_within: 60 s
   request: {do: linear, distance_m: "{distance_m}"}
   poll: {do: state}
   until: {moving: false}
@@ -500,7 +502,8 @@ def test_refused_before_it_begins(
 
 
 def test_nobody_listens(folder: Path, robot: ZmqRobot) -> None:
-    text = DRIVE.replace("ENDPOINT", "tcp://127.0.0.1:9") + "  connect_within: 0.2 s\n"
+    text = DRIVE.replace("ENDPOINT", "tcp://127.0.0.1:9")
+    text = text.replace("connect_within: 60 s", "connect_within: 0.2 s")
     (folder / "actions" / "drive.yaml").write_text(text)
     outcome = to_end(SupervisedActor(drive(folder)))
     assert (outcome.state, outcome.reason) == ("failed", "nobody listens at tcp://127.0.0.1:9")

@@ -132,7 +132,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         server = stack.enter_context(running("serve", *words, log=log))
         wait_for_listener(port, server, log)
         line = f"amberbox+http://r:{key}@127.0.0.1:{port}/"
-        assert main(["join", str(folder), line]) == 0
+        wait_for(lambda: main(["join", str(folder), line]) == 0, "the server has time for it")
         stack.enter_context(running("run", "--quiet", folder, log=tmp_path / "run.log"))
         state = folder / "store" / SUPERVISOR_STATE_FILE
         wait_for(state.is_file, "the robot runs")

@@ -223,7 +223,7 @@ def test_a_run_grants_no_more_than_its_own_risk(tmp_path: Path) -> None:
 
 def test_a_motion_is_stopped_when_its_test_takes_too_long(tmp_path: Path) -> None:
     with zmq_robot() as robot:
-        folder = write_tests(tmp_path, a=DRIVES.format(limit=2))
+        folder = write_tests(tmp_path, a=DRIVES.format(limit=5))
         (folder / "actions").mkdir()
         (folder / "actions" / "a.yaml").write_text(ACTIONS.replace("ENDPOINT", robot.endpoint))
         done = run_tests(folder)
@@ -252,7 +252,7 @@ def test_a_motion_is_stopped_when_its_process_is_killed(tmp_path: Path, who: str
 def test_what_an_action_has_done_is_unknown_so_nothing_more_runs(tmp_path: Path) -> None:
     with zmq_robot() as robot:
         robot.answers["stop"] = b'{"ok": false}'
-        folder = write_tests(tmp_path, a=DRIVES.format(limit=2))
+        folder = write_tests(tmp_path, a=DRIVES.format(limit=5))
         text = ACTIONS.replace("ENDPOINT", robot.endpoint).replace(
             "safe_stop: {do: stop}", "safe_stop: {do: stop}\n  expect: {ok: true}"
         )

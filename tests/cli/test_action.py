@@ -22,6 +22,8 @@ drive:
   description: Drive straight ahead
   kind: zmq_request
   endpoint: ENDPOINT
+  connect_within: 60 s
+  answer_within: 60 s
   request: {do: linear, distance_m: "{distance_m}", slow: "{slow}", where: "{where}"}
   poll: {do: state}
   until: {moving: false}
@@ -101,7 +103,7 @@ def test_check(tmp_path: Path, folder: str, capsys: pytest.CaptureFixture[str]) 
     (tmp_path / "actions" / "a.yaml").write_text(wrong)
     assert main(["check", folder]) == 2
     text = capsys.readouterr().out
-    assert "a.yaml:16: drive.risk: expected one of record, state, moves, got text 'move'" in text
+    assert "a.yaml:18: drive.risk: expected one of record, state, moves, got text 'move'" in text
     assert "list.command: there is no parameter 'foldr'; did you mean 'folder'?" in text
     assert text.endswith("errors, 0 notes\n")
 

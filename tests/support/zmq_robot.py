@@ -18,6 +18,8 @@ drive:
   description: Drive straight ahead
   kind: zmq_request
   endpoint: ENDPOINT
+  connect_within: 60 s
+  answer_within: 60 s
   request: {do: linear, distance_m: "{distance_m}"}
   poll: {do: state}
   until: {moving: false}
@@ -32,6 +34,8 @@ drive:
 light:
   kind: zmq_request
   endpoint: ENDPOINT
+  connect_within: 60 s
+  answer_within: 60 s
   request: {do: light}
   risk: state
 """
