@@ -22,6 +22,7 @@ from amberbox.link.client import (
 )
 from amberbox.link.frames import JournalPosition
 from amberbox.link.record_reader import LinkEvents, LiveValues, RawRowTail, ReachReader
+from amberbox.testing.clock import wait_until
 from amberbox.testing.records import BATTERY, POSE, T0_NS, FakeRun, pose_rows
 from tests.link.robot.rig import Watcher, recorded
 from tests.support.manual_recorder import events
@@ -114,13 +115,13 @@ def test_the_newest_value_of_each_watched_variable(tmp_path: Path) -> None:
     run.write(pose_rows(0, 200))
     live = LiveValues(create_store(tmp_path))
     live.watch([f"{POSE.name}.pose_x", f"{BATTERY.name}.volts", "nothing.here", "no address"])
-    waiting = threading.Event()
     found: dict[str, tuple[int, float | str | None]] = {}
-    for _ in range(100):
-        found |= live.take()
-        if len(found) == 2:
-            break
-        waiting.wait(0.05)
+
+    def has_both() -> bool:
+        found.update(live.take())
+        return len(found) == 2
+
+    wait_until(has_both, "both values")
     live.close()
     run.close()
     assert found[f"{POSE.name}.pose_x"] == (T0_NS + 1990 * 1_000_000, 199.0)

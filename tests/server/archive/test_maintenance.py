@@ -274,7 +274,7 @@ async def _begun(again: ArchiveMaintenance, daily: list[bool], count: int) -> No
     running = asyncio.create_task(again.run())
     while len(daily) < count and not running.done():
         await asyncio.sleep(0.01)
-    await asyncio.sleep(0.05)  # it is written down after that
+    await again._in_thread(lambda: None)  # the same thread has written it down before
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
 

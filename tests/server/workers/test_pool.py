@@ -107,7 +107,7 @@ def test_a_worker_that_was_killed_is_started_again(worker_pool: WorkerPool) -> N
     worker_pool.ask_now(op("echo"), {"text": ""})
     for pid in worker_pool.pids:
         os.kill(pid, signal.SIGKILL)
-    time.sleep(0.1)  # the kernel closes the pipe
+        os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)  # it is dead, and its pipe closed
     assert worker_pool.ask_now(op("echo"), {"text": "here"}) == b"here"
     assert worker_pool.ask_now(op("echo"), {"text": "here"}) == b"here"
 
