@@ -15,7 +15,7 @@ import pytest
 import amberbox
 from amberbox.blackbox.store import journal_reader
 from amberbox.core.errors import UsageError
-from amberbox.testing.clock import PATIENCE_S, wait_until
+from amberbox.testing.clock import wait_until
 from tests.support.processes import command
 from tests.support.ros_nodes import Published, Ros, Verdict, body_of, end, judge, read_truth
 
