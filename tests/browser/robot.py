@@ -22,10 +22,11 @@ from amberbox.link.connection import LinkOptions
 from amberbox.link.policy import Network
 from amberbox.monitoring.current_state import read_heartbeat
 from amberbox.monitoring.findings import Finding, HealthState, Transition, encoded, record_of
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import FakeItem, FakeRun
 
 _REPEAT_S = 1.0
-_END_S = 10.0
+_END_S = PATIENCE_S
 Row = tuple[str, bytes]
 
 

@@ -67,7 +67,7 @@ class Rows:
             self.all.append((time.monotonic(), order, row))
             self._changed.notify_all()
 
-    def wait(self, condition: Callable[[], bool]) -> None:
+    def wait(self, condition: Callable[[], object]) -> None:
         with self._changed:
             assert self._changed.wait_for(condition, PATIENCE_S), self.all
 
@@ -113,8 +113,8 @@ def test_a_probe_that_hangs_says_so_at_its_period_and_disturbs_nobody(
     runner = ProbeRunner(orders, rows.put, [probes])
     start_s = time.monotonic()
     runner.start()
-    rows.wait(lambda: len(rows.of("hanging")) == 4)
-    counted = len(rows.of("counting"))
+    rows.wait(lambda: len(rows.of("hanging")) >= 4)
+    rows.wait(lambda: len(rows.of("counting")) >= 2)
     assert Path(f"{file}.looks").read_text() == "x", "a second look while the first one hangs"
     file.touch()
     rows.wait(lambda: rows.of("hanging")[-1]["ok"] is True)
@@ -124,7 +124,6 @@ def test_a_probe_that_hangs_says_so_at_its_period_and_disturbs_nobody(
     assert silent[:4] == [{"subject": str(file), "ok": None, "error": text, "n": None}] * 4
     first_s = next(at_s for at_s, order, _ in rows.all if order.kind == "hanging")
     assert first_s - start_s >= 0.15
-    assert counted >= 2
     assert len(Path(f"{file}.looks").read_text()) >= 2
 
 
@@ -134,12 +133,11 @@ def test_what_a_look_that_hung_finds_at_last_is_dropped(probes: Path, tmp_path: 
     (probes / "hanging.py").write_text(code)
     runner = ProbeRunner([ProbeOrder("hanging", str(file))], rows.put, [probes])
     runner.start()
-    rows.wait(lambda: len(rows.all) == 1)
+    rows.wait(lambda: rows.all)
     file.touch()
-    rows.wait(lambda: len(rows.all) == 2)
+    rows.wait(lambda: rows.all[-1][2]["ok"] is True)
     runner.close()
-    assert rows.all[1][2]["ok"] is True
-    assert len(Path(f"{file}.looks").read_text()) == 2, "the row is of the second look"
+    assert len(Path(f"{file}.looks").read_text()) >= 2, "the row is of the second look"
 
 
 @pytest.mark.parametrize(
@@ -158,7 +156,7 @@ def test_a_probe_that_fails_is_unknown_with_the_reason_and_looks_again(
     rows = Rows()
     runner = ProbeRunner([ProbeOrder("failing", how)], rows.put, [probes])
     runner.start()
-    rows.wait(lambda: len(rows.all) == 2)
+    rows.wait(lambda: len(rows.all) >= 2)
     runner.close()
     assert rows.all[0][2] == {"subject": how, "ok": None, "error": error, "n": None}
 
@@ -169,9 +167,9 @@ def test_a_probe_that_is_not_there_or_does_not_load_is_unknown(probes: Path) -> 
     orders = [ProbeOrder("countin", "a"), ProbeOrder("torn", "a")]
     runner = ProbeRunner(orders, rows.put, [probes])
     runner.start()
-    rows.wait(lambda: len(rows.all) == 2)
+    rows.wait(lambda: rows.of("countin") and rows.of("torn"))
     runner.close()
-    (missing,), (torn,) = rows.of("countin"), rows.of("torn")
+    missing, torn = rows.of("countin")[0], rows.of("torn")[0]
     assert missing["ok"] is None
     assert "there is no probe 'countin'" in missing["error"]
     assert "did you mean 'counting'" in missing["error"]
@@ -224,6 +222,6 @@ def test_an_order_that_comes_twice_runs_once(probes: Path) -> None:
     rows = Rows()
     runner = ProbeRunner([ProbeOrder("counting", "a")] * 2, rows.put, [probes])
     runner.start()
-    rows.wait(lambda: len(rows.all) == 3)
+    rows.wait(lambda: len(rows.all) >= 3)
     runner.close()
     assert [row["n"] for row in rows.of("counting")][:3] == [0, 1, 2]
