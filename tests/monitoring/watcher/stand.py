@@ -5,7 +5,8 @@ from __future__ import annotations
 import random
 import struct
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +38,7 @@ from amberbox.monitoring.plan import (
 )
 from amberbox.monitoring.record_evaluation import MakeDiagnoser, replay
 from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
-from amberbox.testing.clock import ManualClock
+from amberbox.testing.clock import ManualClock, wait_until
 from tests.support.manual_recorder import ManualBox
 
 VALUE = Schema("std_msgs/Float64", "ros1msg", b"float64 data\n")
@@ -259,9 +260,17 @@ def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
                 yield names[int(number)].encode() + b" " + data, is_live
 
 
-def run_for(watcher: RecordWatcher, stop: threading.Event, seconds: float) -> None:
-    """Run a watcher for a while, in this thread."""
-    timer = threading.Timer(seconds, stop.set)
-    timer.start()
-    watcher.run(stop)
-    timer.join()
+def run_until(watcher: RecordWatcher, holds: Callable[[], object]) -> None:
+    """Run a watcher in this thread until something holds."""
+    stop = threading.Event()
+
+    def look() -> None:
+        try:
+            wait_until(holds)
+        finally:
+            stop.set()
+
+    with ThreadPoolExecutor(1) as pool:
+        looking = pool.submit(look)
+        watcher.run(stop)
+        looking.result()

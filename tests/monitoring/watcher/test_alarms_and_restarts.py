@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from tests.monitoring.watcher.stand import (
     component,
     kill,
     positive,
-    run_for,
+    run_until,
     values_of,
     variable,
     written,
@@ -219,7 +218,7 @@ def test_an_explanation_that_hangs_is_done_without(
         stand.box.hear(NUMBERS["main"], struct.pack("<d", -1.0))
         stand.box.write(0.1)
     watcher = stand.watcher(only(component("base", positive, variable("ros_main"), explain=stuck)))
-    run_for(watcher, threading.Event(), 2.0)
+    run_until(watcher, lambda: values_of(written(stand.path), "amberbox/status"))
     (*_, status) = values_of(written(stand.path), "amberbox/status")
     assert status["level"] == "error"
     assert "no explanation: HangError" in str(status["reason"])
