@@ -38,7 +38,7 @@ def master() -> Iterator[RosMaster]:
     made.stop()
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros1, "_PATIENCE_S", 0.3)
     monkeypatch.setattr(zmq_target, "_PATIENCE_S", 0.3)
@@ -181,6 +181,7 @@ def test_as_many_connect_as_a_large_robot_has(master: RosMaster) -> None:
         assert {sock.recv(100) for sock in sockets} == {b"\x05\0\0\0\x01\0\0\0a"}
 
 
+@pytest.mark.usefixtures("short_waits")
 def test_a_subscriber_that_hangs_holds_nobody_up_for_long(master: RosMaster) -> None:
     """Its queue is bounded by size too, and what it does not get is counted."""
     big = b"\0" * (1 << 20)
@@ -232,6 +233,7 @@ def test_a_subscriber_of_zmq_gets_all_in_order(tmp_path: Path) -> None:
     assert target.dropped() == 0
 
 
+@pytest.mark.usefixtures("short_waits")
 def test_a_subscriber_of_zmq_that_hangs_is_counted(tmp_path: Path) -> None:
     target = ZmqTarget(f"ipc://{tmp_path}/play")
     with playing(target, POSE), subscriber(target.endpoint, rcvhwm=1):

@@ -135,12 +135,12 @@ def test_a_peer_that_is_killed_and_started_again(net: Cable) -> None:
 
 
 def test_a_silent_peer_is_gone_once(net: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node, "EXPIRED_S", 3.0)
     with listening(net) as sink, zyre_peer(net.robot, "robot", "ROPOD") as peer:
         peer.sees("JOIN", "box", "ROPOD")
         peer.order("shout", "ROPOD", CMD, 1, 1)
         sink.wait_for("CMD", 1)
         peer.process.send_signal(signal.SIGKILL)
+        monkeypatch.setattr(node, "EXPIRED_S", 3.0)
         happened(sink, "zyre_exit")
         wait_until(lambda: json.loads(sink.of("network")[-1])["peers"] == 0, "no peer is there")
     assert kinds(sink).count("zyre_exit") == 1
