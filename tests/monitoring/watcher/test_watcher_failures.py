@@ -79,7 +79,7 @@ def test_a_mode_that_hangs_is_unknown_and_the_others_go_on(
     monkeypatch.setattr("amberbox.monitoring.record_evaluation.LIMIT_S", 0.2)
     stand = Stand(tmp_path / "store", 4)
     plan = plan_of(component("mill", endless, variable("ros_main")))
-    for _ in range(10):
+    for _ in range(40):
         stand.tick()
     watcher = stand.watcher(plan)
 
