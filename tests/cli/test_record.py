@@ -74,16 +74,16 @@ def test_the_summary_adds_up() -> None:
 
 def test_it_ends_by_itself_and_prints_json_meanwhile(folder: Path) -> None:
     began = time.monotonic()
-    process = record(folder, "--for", "2.6 s", "--json")
+    process = record(folder, "--for", "4.6 s", "--json")
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
-    assert time.monotonic() - began >= 2.6
+    assert time.monotonic() - began >= 4.6
     states = [json.loads(line) for line in output.splitlines()]
-    assert len(states) == 2
-    assert [item["name"] for item in states[1]["items"]] == ["sim_odom", "sim_wifi"]
-    odom = states[1]["items"][0]
-    assert odom["rate_hz"] == pytest.approx(50, abs=15)
-    assert states[1]["disk_free_bytes"] > 0
+    assert 1 <= len(states) <= 4, "one a second"
+    assert [item["name"] for item in states[-1]["items"]] == ["sim_odom", "sim_wifi"]
+    odom = states[-1]["items"][0]
+    assert 10 < odom["rate_hz"] < 200, "50 Hz; a busy computer records late, and then at once"
+    assert states[-1]["disk_free_bytes"] > 0
     assert errors.startswith("recorded ")
     assert all(journal.finished for journal in journal_reader.journals(folder / "store"))
 
