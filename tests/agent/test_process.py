@@ -34,7 +34,7 @@ while True:
 
 
 def child(text: str, **more: float | bool) -> ChildProcess:
-    made = ChildProcess("one", [sys.executable, "-S", "-c", text], watchdog_s=0.5, start_s=10.0)
+    made = ChildProcess("one", [sys.executable, "-S", "-c", text], watchdog_s=60.0, start_s=60.0)
     return replace(made, **more)  # type: ignore[arg-type]  # each test knows the types it gives
 
 
@@ -87,7 +87,7 @@ def stepped(lifecycle: ChildLifecycle, is_so: Callable[[], bool]) -> None:
 
 
 def test_a_child_that_hangs_is_killed_and_begins_again(lifecycles: Begin, said: list[str]) -> None:
-    lifecycle, launcher = lifecycles(child(LIVELY))
+    lifecycle, launcher = lifecycles(child(LIVELY, watchdog_s=2.0))
     stepped(lifecycle, lambda: lifecycle.is_up)
     assert lifecycle.process is not None and lifecycle.status == "well"
     first = lifecycle.process.pid
