@@ -104,7 +104,6 @@ class MongoServer:
     # -- one connection
 
     def serve(self, connection: socket.socket) -> None:
-        self._open.add(connection)
         try:
             while True:
                 _, request, _, kind = _HEADER.unpack(head := _read(connection, _HEADER.size))
@@ -198,6 +197,11 @@ class _Listener(socketserver.ThreadingTCPServer):
     def __init__(self, address: tuple[str, int], mongo: MongoServer) -> None:
         self.mongo = mongo
         super().__init__(address, _Connection)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Note a connection before its thread begins, so that none outlives a cut."""
+        self.mongo._open.add(request)
+        super().process_request(request, client_address)
 
 
 class _Connection(socketserver.BaseRequestHandler):

@@ -47,15 +47,29 @@ def boot_s() -> float:
 
 
 class ZmqRobot:
-    """Answers every request at once; ``hears`` keeps them with the time since boot in seconds."""
+    """Answers every request at once; ``hears`` keeps them with the time since boot in seconds.
+
+    What it has heard and whether it moves change as one.
+    """
 
     def __init__(self, socket: zmq.Socket[bytes], endpoint: str) -> None:
         self.endpoint = endpoint
         self.hears: list[tuple[float, Any]] = []
         self.answers: dict[str, bytes] = {}
         """Instead of the usual answer to what is to be done; empty for none."""
-        self.moving = False
+        self._moving = False
+        self._hearing = threading.Lock()
         self._socket = socket
+
+    @property
+    def moving(self) -> bool:
+        with self._hearing:
+            return self._moving
+
+    @moving.setter
+    def moving(self, is_so: bool) -> None:
+        with self._hearing:
+            self._moving = is_so
 
     def heard(self, what: str) -> list[float]:
         """Return when it was told to do something."""
@@ -73,9 +87,10 @@ class ZmqRobot:
             if not self._socket.poll(20):
                 continue
             request = msgspec.json.decode(self._socket.recv())
-            self.hears.append((boot_s(), request))
             done = request["do"]
-            self.moving = (self.moving or done == "linear") and done != "stop"
+            with self._hearing:
+                self._moving = (self._moving or done == "linear") and done != "stop"
+                self.hears.append((boot_s(), request))
             usual = msgspec.json.encode({"ok": True, "moving": self.moving})
             answer = self.answers.get(done, usual)
             if not answer:  # hangs: a REP socket that does not answer takes no more requests
