@@ -126,6 +126,11 @@ def test_the_clock_goes_on_between_messages() -> None:
     assert SPAN[0] == target.times[0] and SPAN[1] - target.times[-1] <= NS // 50
 
 
+def test_the_clock_ends_with_the_last_message_however_fast() -> None:
+    target, _ = played(None)
+    assert target.times == list(SPAN)
+
+
 def test_stop_ends_at_once_also_in_a_loop() -> None:
     target, _ = played(1.0, end_s=102.5)
     assert [data for _, name, data, _ in target.sent if name == "pose"] == [b"0", b"1", b"2"]

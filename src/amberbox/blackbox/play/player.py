@@ -171,11 +171,14 @@ class Player:
         self._began_s = self._clock_due_s = self.clock_s()
         for message in self.messages.latched(self.span[0]):
             self._send(message)
+        at_ns = self.span[0]
         for message in self.messages.read(self.span[0]):
             if message.topic in self.topics:
-                if not self._wait_until_due(message.received_ns, stop):
+                at_ns = message.received_ns
+                if not self._wait_until_due(at_ns, stop):
                     return False
                 self._send(message)
+        self.target.set_clock(at_ns)  # a player that is late sends the last ones at once
         return not stop.is_set()
 
     def _wait_until_due(self, at_ns: int, stop: threading.Event) -> bool:
