@@ -275,13 +275,18 @@ def revisions(job: Job) -> Iterator[str]:
 
 
 @functools.cache
+def surveyed() -> list[Variable]:
+    """Return all variables of the robot, with the values that they have on a drive."""
+    return simulated_variables(Robot(SURVEY_SEED).step_until(SURVEY_S))
+
+
+@functools.cache
 def variables() -> list[Variable]:
     """Return the variables that monitors and symptoms of the robot folder read."""
     wanted = world().wanted
-    said = Robot(SURVEY_SEED).step_until(SURVEY_S)
     return [
         each
-        for each in simulated_variables(said)
+        for each in surveyed()
         if each.path.replace(".", "_") in wanted.get(f"sim_{each.item}", ())
     ]
 

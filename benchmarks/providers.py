@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,10 +28,13 @@ import numpy as np
 from amberbox.consult.context import RobotWindow
 from amberbox.core.clock import NS
 from amberbox.core.contracts import EvidenceNeeds, Span
+from amberbox.core.equations.model_file import load_model
 from amberbox.core.errors import UsageError
+from amberbox.core.expression import Expression
 from amberbox.core.types import Batch, Diagnosis, Status, Symptom
 from amberbox.diagnosis.consistency.components import load_components
 from amberbox.diagnosis.consistency.online import mapped
+from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.models import models_of
 from amberbox.diagnosis.tracker import FaultTracker
 from amberbox.monitoring.engine import Engine
@@ -47,13 +50,16 @@ from benchmarks.diagnosis import (
     outcome_of,
     polite,
     robot_folder,
+    surveyed,
     truth_of,
     world,
 )
-from benchmarks.missions import Batches, Mission, live, mode_of, with_faults
+from benchmarks.missions import Batches, Mission, disturbed, live, mode_of, with_faults
 
 FIRST_SEED = 990_000
-SINGLES, DOUBLES, CHAINED, DRAWN, KNOBS, NOMINAL_H = 30, 30, 20, 30, 10, 0.5
+SINGLES, DOUBLES, CHAINED, DRAWN, KNOBS, READ, NOMINAL_H = 30, 30, 20, 30, 10, 24, 0.5
+READ_BY = ("equations", "components")
+"""Kinds of models; a mission of that kind has a disturbance of a variable that they read."""
 CHOICES: Mapping[str, frozenset[str]] = {
     "FMEA alone": frozenset(),
     "with residuals": frozenset({"equations"}),
@@ -62,6 +68,7 @@ CHOICES: Mapping[str, frozenset[str]] = {
 }
 """By name: kinds of models whose evidence counts."""
 MARKS = "<!-- providers -->", "<!-- end of providers -->"
+READ_MARKS = "<!-- read by models -->", "<!-- end of read by models -->"
 _KEPT = 2  # batches of an item: of 30 s each, and no model looks further back
 
 
@@ -164,12 +171,28 @@ def _kept_place() -> tempfile.TemporaryDirectory[str]:
 def columns() -> Mapping[str, set[str]]:
     """Return the columns of each item that monitors, symptoms or models read."""
     found = {item: {*names} for item, names in world().wanted.items()}
-    for path in models_of(folders()["with both"])["components"].values():
-        for binding in load_components(path).observe.values():
-            for address in binding.value.addresses():
+    for item, names in read_by("components").items():
+        found.setdefault(item, set()).update(names)
+    return found
+
+
+@functools.cache
+def read_by(kind: str) -> Mapping[str, set[str]]:
+    """Return the columns of each item that models of a kind read."""
+    found: dict[str, set[str]] = {}
+    for path in models_of(folders()["with both"])[kind].values():
+        for value in _values_of(kind, path):
+            for address in value.addresses():
                 item, _, variable = address.partition(".")
                 found.setdefault(item, set()).add(variable)
     return found
+
+
+def _values_of(kind: str, path: Path) -> Iterator[Expression]:
+    if kind == "equations":
+        yield from load_model(path).recorded.values()
+    else:
+        yield from (binding.value for binding in load_components(path).observe.values())
 
 
 def residual_monitors() -> frozenset[tuple[str, str]]:
@@ -228,10 +251,26 @@ def _described() -> frozenset[str]:
     return frozenset[str]().union(*(mapped(model, model.faults, modes)[0] for model in loaded))
 
 
+def read(kind: str, seed: int) -> Mission:
+    """Draw a mission with a disturbance of what models of a kind read: evenly over the items."""
+    columns_read = read_by(kind)
+    item = random.Random(f"{kind} {seed}").choice(sorted(columns_read))
+    variables = [
+        each
+        for each in surveyed()
+        if f"sim_{each.item}" == item and each.path.replace(".", "_") in columns_read[item]
+    ]
+    apart = 100_000 * READ_BY.index(kind)  # not the same kind, amount and time twice
+    return replace(disturbed(seed + apart, variables), seed=seed)
+
+
 def work(job: Job) -> list[Outcome]:
     """Make and judge a mission with each choice."""
-    mission = chained(job.seed) if job.kind == "chained" else mission_of(job)
-    truth = truth_of(job.kind, mission)
+    if job.kind in READ_BY:
+        mission, truth = read(job.kind, job.seed), [UNKNOWN]
+    else:
+        mission = chained(job.seed) if job.kind == "chained" else mission_of(job)
+        truth = truth_of(job.kind, mission)
     return [
         replace(
             outcome_of(job.kind, mission, truth, choice.made), cpu_s=choice.cpu_s, evidence=name
@@ -240,7 +279,7 @@ def work(job: Job) -> list[Outcome]:
     ]
 
 
-def table(found: Sequence[Outcome], state: str) -> str:
+def table(found: Sequence[Outcome], state: str, cells: Cells) -> str:
     """Return the figures by choice of evidence, as Markdown."""
     seeds = [outcome.seed for outcome in found] or [0]
     of = {name: [one for one in found if one.evidence == name] for name in CHOICES}
@@ -252,7 +291,7 @@ def table(found: Sequence[Outcome], state: str) -> str:
         f"| what | {' | '.join(CHOICES)} |",
         f"|---|{'---|' * len(CHOICES)}",
     ]
-    for what, cell in _CELLS.items():
+    for what, cell in cells.items():
         lines.append(f"| {what} | {' | '.join(cell(of[name]) for name in CHOICES)} |")
     return "\n".join(lines) + "\n"
 
@@ -282,7 +321,13 @@ def _cpu(found: Sequence[Outcome]) -> str:
     return f"{100.0 * sum(o.cpu_s for o in found) / max(seconds, 1e-9):.2f} %"
 
 
-_CELLS: Mapping[str, Callable[[Sequence[Outcome]], str]] = {
+Cells = Mapping[str, Callable[[Sequence[Outcome]], str]]
+_OF_ALL: Cells = {
+    "diagnoses of a sound robot": lambda o: _false(_kind(o, "nominal")),
+    "answer before any fault": lambda o: _share([x.early > 0 for x in o if x.kind != "nominal"]),
+    "processor for the tracker, of a core": _cpu,
+}
+_OF_FAULTS: Cells = {
     "one fault, in the first group": lambda o: _share([x.is_right for x in _kind(o, "single")]),
     "one fault, first member": lambda o: _share([x.leads for x in _kind(o, "single")]),
     "two faults, in the first group": lambda o: _share([x.is_right for x in _kind(o, "double")]),
@@ -302,10 +347,35 @@ _CELLS: Mapping[str, Callable[[Sequence[Outcome]], str]] = {
     "two faults named, from the onset of the second (median)": lambda o: _named_s(
         _kind(o, "double")
     ),
-    "answer before any fault": lambda o: _share([x.early > 0 for x in o if x.kind != "nominal"]),
-    "diagnoses of a sound robot": lambda o: _false(_kind(o, "nominal")),
-    "processor for the tracker, of a core": _cpu,
+    **_OF_ALL,
 }
+
+
+def _of_read(kind: str, name: str) -> Cells:
+    return {
+        f"{name}: answered at any time": lambda o: _share([x.shows for x in _kind(o, kind)]),
+        f"{name}: answered, and it stands": lambda o: _share([x.stands for x in _kind(o, kind)]),
+        f"{name}: said not to be in the FMEA": lambda o: _share([x.leads for x in _kind(o, kind)]),
+        f"{name}: wrong mode, above 80 %": lambda o: _share([x.misleads for x in _kind(o, kind)]),
+    }
+
+
+_OF_READ: Cells = {
+    **_of_read("equations", "read by `base.yaml`"),
+    **_of_read("components", "read by `chain.yaml`"),
+    **_OF_ALL,
+}
+
+
+def tables(found: Sequence[Outcome], state: str) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield the tables of the missions that were driven, with the marks of their places."""
+    read = [outcome for outcome in found if outcome.kind in READ_BY]
+    others = [outcome for outcome in found if outcome.kind not in (*READ_BY, "nominal")]
+    nominal = [outcome for outcome in found if outcome.kind == "nominal"]
+    if others:
+        yield table([*others, *nominal], state, _OF_FAULTS), MARKS
+    if read:
+        yield table([*read, *nominal], state, _OF_READ), READ_MARKS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -314,7 +384,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     counts = counts_of(
         options.single, options.double, options.unknown, options.knobs, options.hours
     )
-    counts["chained"] = options.chained
+    counts |= {"chained": options.chained} | dict.fromkeys(READ_BY, options.read)
     try:
         found = list(kept_lines(options.keep, Outcome)) if options.keep else []
     except UsageError as error:
@@ -323,10 +393,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     done = {(outcome.kind, outcome.seed) for outcome in found}
     wanted = [job for job in jobs(counts, options.first_seed) if (job.kind, job.seed) not in done]
     found += [] if options.print else _run(wanted, options.keep, options.processes)
-    figures = table(found, options.state)
-    print(figures)
-    if options.page:
-        options.page.write_text(with_figures(options.page.read_text(), figures, MARKS))
+    for figures, marks in tables(found, options.state):
+        print(figures)
+        if options.page:
+            options.page.write_text(with_figures(options.page.read_text(), figures, marks))
     return 0
 
 
@@ -349,12 +419,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--chained", type=int, default=CHAINED, help="missions with two faults of chain.yaml")
     add("--unknown", type=int, default=DRAWN, help="missions with a drawn disturbance")
     add("--knobs", type=int, default=KNOBS, help="missions with a fault of unknown_faults.yaml")
+    add("--read", type=int, default=READ, help="disturbances of what each kind of models reads")
     add("--hours", type=float, default=NOMINAL_H, help="hours without any fault")
     add("--first-seed", type=int, default=FIRST_SEED)
     add("--processes", type=int, default=1, help="so many at once")
     add("--keep", type=Path, metavar="FILE", help="add what each mission gave; leave out its own")
     add("--print", action="store_true", help="run nothing, print the table of --keep")
-    add("--page", type=Path, metavar="FILE", help="renew the table of docs/reference/accuracy.md")
+    add("--page", type=Path, metavar="FILE", help="renew the tables of docs/reference/accuracy.md")
     add("--state", default="", help="with --page: the state of the code, as 'version 0.9'")
     return parser
 
