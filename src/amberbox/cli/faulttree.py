@@ -102,7 +102,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_seconds(parser, _SECONDS)
     parser.add_argument(
         "--nodes", type=int, default=MOST_NODES, metavar="N",
-        help="give up at N nodes, up to 300 bytes each (default %(default)s)",
+        help="give up at N nodes, up to 200 bytes each (default %(default)s)",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="one object")
 

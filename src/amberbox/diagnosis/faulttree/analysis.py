@@ -498,7 +498,8 @@ def analyse(
         return _bounded(known, graph, parts, solved, budget, orders)
     if not unknown:
         known = _with_probability(known, solved, importance)
-    known = _with_cut_sets(known, solved, budget.until(_TIME_TO_BE_EXACT))
+    time_share = _TIME_TO_BE_EXACT if unknown else _TIME_FOR_CUT_SETS
+    known = _with_cut_sets(known, solved, budget.until(time_share))
     return _bounded(known, graph, parts, solved, budget) if known.incomplete else known
 
 
@@ -525,6 +526,7 @@ def _with_cut_sets(known: Analysis, solved: list[SolvedModule], budget: Budget) 
 
 
 _TIME_TO_BE_EXACT = 0.5
+_TIME_FOR_CUT_SETS = 0.8  # where no bounds are needed any more
 _NONE: Mapping[int, tuple[int, ...]] = {}
 _MOST_JOINED = 500  # cut sets whose joint probability is looked at more closely
 _ANY = 0.1  # for events without probability: then the smallest cut sets come first

@@ -26,7 +26,8 @@ _FEWEST_STATES = 64  # in the first round
 _MOST_STATES = 32_768
 _MOST_STATES_UNTIMED = 1_024
 _NODES_OF_A_STATE = 32  # as much memory as a state takes at most
-_GROWTH = 3
+_MOST_GROWTH = 8.0
+_BETTER_ORDERS = 3  # of so many orders that were tried one is tried with more states
 _LEAST_GROWTH = 1.3  # a round with hardly more states is not worth its time
 _USED = 0.8  # of the time that is left, so that the last round ends in time
 _LARGE_PART = 200  # gates, from which on trying an order takes long
@@ -130,8 +131,8 @@ class BoundedSearch:
         """Return how many times more states the next round can have, given when the last began."""
         gone = self.budget.time_gone()
         if gone <= began:
-            return _GROWTH
-        return min(_GROWTH, _USED * (1.0 - gone) * self.tried / (gone - began))
+            return _MOST_GROWTH
+        return min(_MOST_GROWTH, _USED * (1.0 - gone) * self.tried / (gone - began))
 
     def _bounds(self, size: int) -> ProbabilityBounds:
         found: dict[int, ProbabilityBounds] = {}
@@ -170,7 +171,7 @@ class BoundedSearch:
             found.append((bounds.upper - bounds.lower, order, bounds))
         self.tried = max(self.tried, len(found))
         found.sort(key=lambda entry: entry[0])
-        better = found[: max(1, len(found) // _GROWTH)]
+        better = found[: max(1, len(found) // _BETTER_ORDERS)]
         self.orders[part.vertex] = [order for _, order, _ in better]
         return ProbabilityBounds(
             max(bounds.lower for _, _, bounds in found), min(bounds.upper for _, _, bounds in found)

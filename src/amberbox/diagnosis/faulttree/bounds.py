@@ -142,7 +142,8 @@ class _Sweep:
 
     ``counts`` has for each gate that is begun how many of its inputs have happened (of an XOR,
     whether an odd number has); ``open`` are its inputs that are not decided yet. ``lower`` is the
-    probability that the top event is known to have, ``lost`` how much more it may be.
+    probability that the top event is known to have, ``lost`` how much more it may be. ``untouched``
+    are the bounds of gates none of whose leaves is decided: they are the same in all states.
     """
 
     graph: FaultGraph
@@ -154,6 +155,7 @@ class _Sweep:
     lower: float = 0.0
     lost: float = 0.0
     counts: dict[int, Counts] = field(default_factory=dict)
+    untouched: dict[int, _Range] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vertices = {number: self.graph.vertices[number] for number in self.part.inner}
@@ -179,8 +181,11 @@ class _Sweep:
     def run(self, most_lost: float = math.inf) -> ProbabilityBounds:
         """Decide all leaves and return bounds of the part; see ``bounds_of_part``."""
         most = max(4 * self.size, _FEWEST_ROWS)
+        found = self._ranges(self._groups(), slice(None))
+        self.untouched = {number: found[number] for number in self.open}
         for leaf in self.order:
             check_budget(self.budget, 0)
+            self._touch(leaf)
             chance = self.of_leaf[leaf].upper
             self.mass = np.concatenate([self.mass * (1.0 - chance), self.mass * chance])
             self.counts = {n: np.concatenate([entry] * 2) for n, entry in self.counts.items()}
@@ -192,6 +197,14 @@ class _Sweep:
         lower = min(1.0, self.lower)
         upper = lower + self.lost + float(np.sum(self.mass))
         return ProbabilityBounds(lower, min(1.0, upper))
+
+    def _touch(self, leaf: int) -> None:
+        """Forget the bounds of all gates above a leaf."""
+        waiting = [leaf]
+        while waiting:
+            for number in self.users.get(waiting.pop(), ()):
+                if self.untouched.pop(number, None) is not None:
+                    waiting.append(number)
 
     def at_first(self) -> _Range:
         """Return the bounds of the part while no leaf is decided."""
@@ -264,6 +277,7 @@ class _Sweep:
             block = slice(start, min(rows, start + _BLOCK))
             ranges = self._ranges(groups, block)
             matters = self._matter(ranges)
+            anyway = np.array([True])
             low[block], high[block] = ranges[top].low, ranges[top].high
             for number in self.open:
                 known, counts = ranges[number], self.counts.get(number)
@@ -275,15 +289,21 @@ class _Sweep:
                     settled[number] = begun if counts is None else counts.copy()
                 values = settled[number][block]
                 values[np.broadcast_to(sure, values.shape)] = _YES
-                values[np.broadcast_to(never | ~matters[number], values.shape)] = _NO
+                unneeded = ~matters.get(number, anyway)
+                values[np.broadcast_to(never | unneeded, values.shape)] = _NO
         self.counts = settled
         return low, high
 
     def _matter(self, ranges: Mapping[int, _Range]) -> dict[int, Flags]:
-        """Return by open gate in which states the top event may depend on it."""
+        """Return by open gate in which states the top event may depend on it.
+
+        Those that are untouched are left out.
+        """
         found: dict[int, Flags] = {self.part.vertex: np.array([True])}
         undecided: dict[int, Flags] = {}
         for number in reversed(self.open):
+            if number in self.untouched:
+                continue
             if number not in found:
                 found[number] = np.array([False])
                 for user in self.users[number]:
@@ -310,10 +330,13 @@ class _Sweep:
         return rows[first], np.add.reduceat(self.mass[rows], first)
 
     def _groups(self) -> dict[int, list[list[int]]]:
-        """Return the open inputs of each open gate, in groups that share no open leaf."""
+        """Return the open inputs of each touched gate, in groups that share no open leaf."""
         below = {leaf: known.below for leaf, known in self.leaves.items()}
         found: dict[int, list[list[int]]] = {}
         for number, inputs in self.open.items():
+            if number in self.untouched:
+                below[number] = self.untouched[number].below
+                continue
             below[number] = 0
             groups: list[tuple[int, list[int]]] = []
             for entry in inputs:
@@ -329,8 +352,10 @@ class _Sweep:
 
     def _ranges(self, groups: Mapping[int, list[list[int]]], block: slice) -> dict[int, _Range]:
         """Return the bounds of all open gates in the states of a block."""
-        found: dict[int, _Range] = dict(self.leaves)
+        found: dict[int, _Range] = self.leaves | self.untouched
         for number in self.open:
+            if number in self.untouched:
+                continue
             inputs = [[found[entry] for entry in group] for group in groups[number]]
             counts = self.counts.get(number)
             counts = None if counts is None else counts[block]

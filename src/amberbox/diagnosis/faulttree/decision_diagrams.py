@@ -13,19 +13,21 @@ from amberbox.diagnosis.faulttree.graph import (
     FALSE,
     TRUE,
     FaultGraph,
+    FaultGraphVertex,
     FaultTreeModule,
     variable_orders,
 )
 
 CHECK_EVERY = 4096  # steps between two checks of the deadline; a power of two
 # The most nodes that are held at a time by default, of up to 300 bytes each
-MOST_NODES = 1_400_000
+MOST_NODES = 2_400_000
 
 
 class ExhaustedError(Exception):
     """A budget was used up; ``reason`` names it, in words for the result.
 
-    ``done`` counts the completed steps; ``order`` is the most promising order of the variables.
+    ``done`` counts the operations on two diagrams that were begun; ``order`` is the most promising
+    order of the variables.
     """
 
     def __init__(self, reason: str, done: int = 0, order: tuple[int, ...] = ()) -> None:
@@ -56,7 +58,8 @@ _SHARE_OF_CACHE = 4
 class Diagram:
     """Nodes of a diagram: the level of the variable, and its true and false branches.
 
-    ``limit`` bounds the number of nodes and cached results together.
+    The budget bounds the number of nodes and cached results together. ``steps`` counts operations
+    on two nodes: every order of the variables needs the same number of them for a tree.
     """
 
     budget: Budget
@@ -65,6 +68,7 @@ class Diagram:
     lows: list[int] = field(default_factory=lambda: [0, 1])
     tables: dict[int, dict[int, int]] = field(default_factory=dict)
     caches: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
+    steps: int = 0
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -139,6 +143,7 @@ class Diagram:
         ``todo`` is a stack of pairs to compute, as one number, and below them, inverted, the pair
         whose two branches they are. The code is one loop because most of the time is spent in it.
         """
+        self.steps += 1
         levels, highs, lows, tables = self.levels, self.highs, self.lows, self.tables
         cache = self.caches[absorbing]
         todo = [left << _SHIFT | right if left < right else right << _SHIFT | left]
@@ -327,9 +332,12 @@ def _limited(
     return family.node(level, family.without(high, low), low)
 
 
-_FIRST_ALLOWANCE = 60_000
-_FEWEST_ORDERS = 3
-_GROWTH = 4
+# Nodes that orders of the variables are tried with, and how many orders; then the best get all
+_TRIALS = (60_000, 99), (300_000, 4)
+_BEST_ORDERS = 2
+# A part of whose operations the trials did less than this will hardly be solved: it gets less time
+_HOPEFUL = 0.9
+_TIME_OF_HOPELESS = 0.25
 _COLLECT_ABOVE = 200_000
 
 
@@ -440,25 +448,32 @@ def _smallest(sets: DiagramNodes, weights: Sequence[int]) -> int:
 def _decisions(
     graph: FaultGraph, part: FaultTreeModule, budget: Budget
 ) -> tuple[tuple[int, ...], DiagramNodes]:
-    """Build the diagram of a part: try all orders with few nodes, the better half with more.
+    """Build the diagram of a part: try all orders with few nodes, the best ones with more.
 
-    An order is better if more of the gates were processed before its nodes were used up.
+    An order is better if more of the operations were done before its nodes were used up.
     """
     candidates = variable_orders(graph, part)
-    allowance, most = _FIRST_ALLOWANCE, budget.most_nodes(MOST_NODES)
-    while True:
+    hopeful = _HOPEFUL * sum(_operations(graph.vertices[number]) for number in part.inner)
+    most = budget.most_nodes(MOST_NODES)
+    reason = ""
+    for allowance, count in (*_TRIALS, (most, _BEST_ORDERS)):
         reached: list[int] = []
-        for order in candidates:
+        for order in candidates[:count]:
             nodes = min(allowance, most)
             try:
                 return order, _build(graph, part, order, replace(budget, nodes=nodes))
             except ExhaustedError as error:
-                if nodes == most or budget.is_over():
-                    raise ExhaustedError(error.reason, error.done, candidates[0]) from error
+                reason = error.reason
+                if budget.is_over():
+                    raise ExhaustedError(reason, error.done, candidates[0]) from error
                 reached.append(error.done)
-        ranked = sorted(zip(reached, candidates, strict=True), key=lambda entry: -entry[0])
-        candidates = [order for _, order in ranked[: max(_FEWEST_ORDERS, len(ranked) // 2)]]
-        allowance *= _GROWTH
+        ranked = sorted(zip(reached, candidates, strict=False), key=lambda entry: -entry[0])
+        candidates = [order for _, order in ranked]
+        if allowance >= most:
+            break
+        if allowance == _TRIALS[-1][0] and ranked[0][0] < hopeful:
+            budget = budget.until(_TIME_OF_HOPELESS)
+    raise ExhaustedError(reason, 0, candidates[0])
 
 
 def _build(
@@ -469,11 +484,11 @@ def _build(
     made |= {leaf: bdd.stored(level, 1, 0) for level, leaf in enumerate(order)}
     uses = _uses(graph, part)
     collected = _COLLECT_ABOVE
-    for done, number in enumerate(part.inner):
+    for number in part.inner:
         try:
             _add(bdd, graph, number, made)
         except ExhaustedError as error:
-            raise ExhaustedError(error.reason, done) from error
+            raise ExhaustedError(error.reason, bdd.steps) from error
         for entry in graph.vertices[number].inputs:
             uses[entry] -= 1
             if not uses[entry]:
@@ -492,6 +507,14 @@ def _add(bdd: Diagram, graph: FaultGraph, number: int, made: dict[int, int]) -> 
     made[number] = gate_of_diagrams(bdd, vertex.kind, inputs, vertex.count)
     check_budget(bdd.budget, len(bdd))
     bdd.forget()
+
+
+def _operations(vertex: FaultGraphVertex) -> int:
+    """Return how many operations on two diagrams make the one of a gate."""
+    size, count = len(vertex.inputs), vertex.count
+    if vertex.kind == "atleast":
+        return 2 * sum(min(count, size - place) for place in range(size))
+    return {"not": 0, "xor": 3}.get(vertex.kind, size)
 
 
 def _uses(graph: FaultGraph, part: FaultTreeModule) -> dict[int, int]:
