@@ -19,7 +19,7 @@ from amberbox.diagnosis.faulttree.graph import (
 )
 
 CHECK_EVERY = 4096  # steps between two checks of the deadline; a power of two
-# The most nodes that are held at a time by default, of up to 300 bytes each
+# The most nodes that are held at a time by default, of up to 200 bytes each
 MOST_NODES = 2_400_000
 
 
