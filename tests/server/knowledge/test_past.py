@@ -15,7 +15,7 @@ from amberbox.core.timestamps import format_time
 from amberbox.core.types import Status
 from amberbox.monitoring.findings import record_of
 from amberbox.server.knowledge import worker
-from amberbox.server.knowledge.questions import AskRules, encode_question
+from amberbox.server.knowledge.questions import AskDiagnosis, AskRules, encode_question
 from amberbox.server.knowledge.worker import without_paths
 from amberbox.testing.records import BATTERY, T0_NS, FakeRun
 from tests.server.archive.recordings import Robot
@@ -23,6 +23,16 @@ from tests.server.house import House, house
 from tests.server.knowledge import robot as sim
 
 NAME = "ropod_001"
+FULL = """\
+kind: components
+types:
+  cell:
+    ports: {level: [full, low]}
+    modes: {works: {nominal: true, constraints: [level == full]}, unknown: {probability: 1e-6}}
+components: {cell: cell}
+observe:
+  cell.level: {value: battery.volts > 22, values: {true: full, false: low}}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +55,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         watch.close()
         robot.hand_in_all(found.services.archive)
         assert found.services.archive.commit(0).rows
-        sim.hand_in(found)
+        sim.hand_in(found, more={"models/full.yaml": FULL.encode()})
         yield found
 
 
@@ -68,6 +78,16 @@ def test_statuses_of_the_archive_are_facts(home: House) -> None:
     found = ask(home, "status(battery, L, _, _)", from_=format_time(T0_NS))
     assert {answer["L"] for answer in found["answers"]} == {"ok"}  # no event told of the change
     assert found["proof"][0][0]["at"].startswith("watcher, ")
+
+
+def test_a_model_of_components_reads_items_of_the_archive(home: House) -> None:
+    def diagnosed(second: int) -> str:
+        at = format_time(T0_NS + second * NS)
+        asked = AskDiagnosis(robot=NAME, now_ns=T0_NS + 700 * NS, at=at, config_hash=sim.HASH)
+        return str(worker.diagnose(home.services.folder, encode_question(asked)))
+
+    assert "full: not all are sound: cell" not in diagnosed(300)
+    assert "full: not all are sound: cell" in diagnosed(500)
 
 
 def test_answers_name_no_folder_of_the_server() -> None:

@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 import msgspec
 from sqlalchemy import func, select
 
+from amberbox.blackbox.journal import channels
 from amberbox.blackbox.query.record_window import RecordWindow
 from amberbox.blackbox.retention.missions import RecordedMission
 from amberbox.consult.context import RobotWindow, context_from_findings
@@ -439,7 +440,10 @@ class ServerWindow(RecordWindow):
     robot: str
 
     def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
-        """Yield the rows that the robot recorded on a derived channel."""
+        """Yield the rows of a channel, of which also the newest have come, or of an item."""
+        if topic not in channels.names():
+            yield from super().rows(topic, names, span)
+            return
         for entry in derived_records(self.stores, self.robot, topic, span, MOST):
             yield {"received": entry.at_ns, **dict.fromkeys(names), **entry.values}
 
