@@ -40,7 +40,7 @@ PAGES: Mapping[str, str] = {
     "/recordings": "/recordings",
     "/recordings/{robot}": "/recordings/ropod_001",
     "/downloads": "/downloads",
-    "/models": "/models",
+    "/detectors": "/detectors",
     "/knowledge": "/knowledge",
     "/knowledge/{robot}": "/knowledge/ropod_001",
     "/account": "/account",
@@ -58,8 +58,8 @@ PAGES: Mapping[str, str] = {
     "/sign-in": "/sign-in",
 }
 """Each page by its route, and where to find one of it that shows much."""
-ELSEWHERE = {"/setup", "/in"}
-"""Pages that a server of its own shows: test_foundation.py, tests/demo."""
+ELSEWHERE = {"/setup", "/in", "/models"}
+"""Pages that a server of its own shows (test_foundation.py, tests/demo), and a former address."""
 DEEPER = {"/robots/{robot}/commands/{id}", "/robots/{robot}/models/{name}"}
 """Pages whose addresses are as long as those of fragments."""
 FOLDED_WHERE_NARROW = "/robots/{robot}/data"

@@ -1,4 +1,4 @@
-"""The page of models of detectors in a browser: learn one, see its promise, fetch, delete."""
+"""The page of learnt detectors in a browser: learn one, see its promise, fetch, delete."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,8 @@ from tests.browser.page_checks import judge
 
 def test_a_model_is_learnt_fetched_and_deleted(page_as: PageAs, tmp_path: Path) -> None:
     page = page_as("technician", width=390)
-    page.goto("/models?robot=ropod_001")
+    page.goto("/models?robot=ropod_001")  # as it was called before
+    expect(page).to_have_url(re.compile(r"/detectors\?robot=ropod_001$"))
     expect(page.get_by_role("checkbox", name="ropod_001")).to_be_checked()
     judge(page, "models-form")
     page.get_by_label(re.compile("^As a team")).check()
@@ -29,7 +30,7 @@ def test_a_model_is_learnt_fetched_and_deleted(page_as: PageAs, tmp_path: Path) 
     job = page.locator(".download").first
     expect(job).to_have_attribute("data-state", "failed")
     expect(job).to_contain_text("there is no mission 'nowhere'")
-    page.get_by_text("Learn a model").click()
+    page.get_by_text("Learn detectors").click()
     page.get_by_label("Missions by name").fill("")
     page.get_by_role("button", name="Learn it").click()
     expect(job).to_contain_text("night version 2")
@@ -48,6 +49,6 @@ def test_a_model_is_learnt_fetched_and_deleted(page_as: PageAs, tmp_path: Path) 
 
 def test_who_only_looks_sees_models_and_no_form(page_as: PageAs) -> None:
     page = page_as("viewer")
-    page.goto("/models")
-    expect(page.get_by_role("heading", name="Models of detectors")).to_be_visible()
+    page.goto("/detectors")
+    expect(page.get_by_role("heading", name="Learnt detectors")).to_be_visible()
     expect(page.locator("#new")).to_have_count(0)

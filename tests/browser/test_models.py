@@ -24,7 +24,7 @@ def test_from_the_diagnosis_to_a_model(page_as: PageAs) -> None:
     expect(page.locator("svg .level-error.node")).to_have_attribute("data-id", "arm")
     page.get_by_role("link", name="Without main.out=on").press("Enter")
     expect(page.get_by_role("cell", name="main=tripped", exact=True)).to_be_visible()
-    page.get_by_role("link", name="All models").click()
+    page.get_by_role("link", name="All robot models").click()
     expect(page.get_by_role("link", name="large")).to_be_visible()
 
 

@@ -87,14 +87,14 @@ def test_a_model_is_learnt_from_what_robots_recorded(home: House) -> None:
 def test_the_page_leads_to_the_order_that_installs_a_model(home: House) -> None:
     told = learnt(home, detectors=["guard"])
     link = f"/robots/{ROBOT}/commands?action=model.install&amp;p.sha256={told['sha256']}"
-    assert link not in home.client("technician").get("/models").text
+    assert link not in home.client("technician").get("/detectors").text
     able = json.dumps({"actions": [install_action(Path("robot")).announced()]})
     row = {"robot": ROBOT, "store_id": "", "answered": 0, "actions": able, "actions_ns": 0,
            "lease": 0, "holder": "", "run": ""}  # fmt: skip
     with home.services.database.begin() as connection:
         connection.execute(COMMAND_ROBOT.insert(), [row])
-    assert link in home.client("technician").get("/models").text
-    assert link not in home.client("viewer").get("/models").text
+    assert link in home.client("technician").get("/detectors").text
+    assert link not in home.client("viewer").get("/detectors").text
     order = html.unescape(link)
     assert told["sha256"] in home.client("technician").get(order).text
 

@@ -1,4 +1,4 @@
-"""The page of models of detectors: learn one from robots' missions, its progress, its versions."""
+"""The page of learnt detectors: let a model be learnt from missions, its progress, its versions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cache
 from typing import Annotated, Any
 
 from fastapi import Query, Request, Response
+from starlette.responses import RedirectResponse
 
 from amberbox.core.errors import UsageError
 from amberbox.detection.learn import DEFAULT_DETECTORS, make_detectors
@@ -24,7 +25,7 @@ _MOST = 200
 _Robots = Annotated[list[Annotated[str, Query(max_length=64)]], Query(max_length=100)]
 
 
-@routes.get("/models", "models.read", each=True)
+@routes.get("/detectors", "models.read", each=True)
 def show_models(
     request: Request, fleet: Fleet, who: Who,
     robot: _Robots = [],  # noqa: B006 - FastAPI copies it
@@ -34,6 +35,13 @@ def show_models(
         request, "learnt_models/models.html", robots=_robots(fleet, who), chosen=robot,
         detectors=_detectors(), usual=DEFAULT_DETECTORS, **_listed(fleet, who),
     )  # fmt: skip
+
+
+@routes.get("/models", "models.read", each=True)
+def show_models_where_they_were(request: Request) -> Response:
+    """Lead from the page's former address to its present one, with the same query."""
+    query = request.url.query
+    return RedirectResponse(f"/detectors?{query}" if query else "/detectors", 308)
 
 
 @routes.get("/pieces/models", "models.read", each=True)

@@ -1,4 +1,4 @@
-// Models of detectors: the form that lets the server learn one, and the list with its progress.
+// Learnt detectors: the form that lets the server learn one, and the list with its progress.
 
 import { ApiError, requestJson, whileBusy } from "./api.js";
 import { find, findAll } from "./dom.js";
