@@ -12,6 +12,7 @@ import pytest
 from amberbox.blackbox.query import record
 from amberbox.core.errors import UsageError
 from amberbox.core.expression import parse
+from amberbox.core.svg import root
 from amberbox.experiments.experiment import CriterionOptions, ExperimentOptions
 from amberbox.experiments.procedure import Procedure
 from amberbox.experiments.report import RunReport, compare, intervals, make_report
@@ -125,11 +126,11 @@ def test_a_run_that_goes_on_has_no_verdict_and_judges_nothing(drive: Procedure) 
 
 
 def test_the_page_escapes_every_text_and_runs_nothing(drive: Procedure, store: Path) -> None:
-    page = report_page(reported(drive, store), lambda: "<svg id='diagram'></svg>")
+    page = report_page(reported(drive, store), lambda: root("bpmn", (1500, 9), HOSTILE, ()))
     assert "<script" not in page and "href=" not in page and "src=" not in page
     assert "\u202e" not in page
     assert page.count("&lt;script&gt;") >= 4
-    assert "<svg id='diagram'>" in page and "<polyline" in page
+    assert '<section class="turned"><h2>Diagram' in page and "<polyline" in page
     assert "prefers-color-scheme: dark" in page and "@media print" in page
 
 

@@ -48,7 +48,7 @@ from amberbox.experiments.procedure import Procedure, procedure_of
 from amberbox.experiments.profile import SUFFIX, Experiment, list_experiments, read_experiment
 from amberbox.experiments.report import Comparison, RunReport, compare, make_report
 from amberbox.experiments.report_junit import junit
-from amberbox.experiments.report_page import report_page
+from amberbox.experiments.report_page import Diagram, report_page
 from amberbox.experiments.run import ExperimentRun, RunEvent, element_states
 
 _RECORD_WAIT_S = 5.0
@@ -456,7 +456,7 @@ def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def _diagram(experiment: Experiment, report: RunReport) -> Callable[[], str]:
+def _diagram(experiment: Experiment, report: RunReport) -> Diagram:
     """Return the drawing of the diagram with the states that the run has come to."""
     states = element_states(procedure_of(experiment), report.events)
-    return lambda: str(draw_bpmn(experiment.model, states))
+    return lambda: draw_bpmn(experiment.model, states)

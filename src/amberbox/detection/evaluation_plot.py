@@ -92,8 +92,9 @@ def draw(data: PlotData, judged: Evaluation, heading: str, kind: str) -> bytes:
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f23; --paper: #fff; --dim: #5b6470; --line: #d5d9de;
   --curve: #0b62b8; --limit: #c62828; --fault: #f3d9a4; --alarm: #c62828; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e8ea; --paper: #16191d; --dim: #9aa4b0;
-  --line: #3a414a; --curve: #6cb2ff; --limit: #ff7b72; --fault: #5a4620; --alarm: #ff7b72; } }
+@media screen and (prefers-color-scheme: dark) { :root { --ink: #e6e8ea; --paper: #16191d;
+  --dim: #9aa4b0; --line: #3a414a; --curve: #6cb2ff; --limit: #ff7b72;
+  --fault: #5a4620; --alarm: #ff7b72; } }
 body { font: 15px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper);
   max-width: 64rem; margin: 0 auto; padding: 1.5rem 1rem; overflow-wrap: anywhere; }
 h2 { margin: 2rem 0 .5rem; border-bottom: 1px solid var(--line); } .dim { color: var(--dim); }

@@ -58,10 +58,13 @@ STYLE = """\
 --bpmn-band:#e6eaee;--bpmn-current:#0b5fff;--bpmn-current-fill:#dbe8ff;--bpmn-done:#1e7a46;
 --bpmn-done-fill:#e2f4e8;--bpmn-failed:#b42318;--bpmn-failed-fill:#fde4e1;--bpmn-waiting:#8a5a00;
 --bpmn-waiting-fill:#fff0cf;font-family:system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
-@media (prefers-color-scheme:dark){.bpmn{--bpmn-paper:#12181f;--bpmn-line:#b9c4cf;
+@media screen and (prefers-color-scheme:dark){.bpmn{--bpmn-paper:#12181f;--bpmn-line:#b9c4cf;
 --bpmn-text:#e8edf2;--bpmn-fill:#1c252e;--bpmn-pool:#161d25;--bpmn-band:#35414d;--bpmn-current:#7fb0ff;
 --bpmn-current-fill:#15305e;--bpmn-done:#6fd09a;--bpmn-done-fill:#143524;--bpmn-failed:#ff9287;
 --bpmn-failed-fill:#4d1a15;--bpmn-waiting:#f0c060;--bpmn-waiting-fill:#3e2f0c}}
+@page bpmn{size:landscape;margin:10mm}
+@media print{.bpmn{print-color-adjust:exact}
+:root.bpmn{page:bpmn;width:100%;height:auto;max-height:95vh}}
 """
 RULES = """\
 .bpmn{background:var(--bpmn-paper)}

@@ -16,10 +16,11 @@ WIDE, HIGH, LEFT, TOP, BOTTOM = 720.0, 220.0, 70.0, 20.0, 24.0
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f23; --paper: #fff; --dim: #5b6470; --line: #d5d9de;
   --good: #1a7f37; --bad: #c62828; --open: #9a6700; --curve: #0b62b8; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e8ea; --paper: #16191d; --dim: #9aa4b0;
-  --line: #3a414a; --good: #4fc36b; --bad: #ff7b72; --open: #e3b341; --curve: #6cb2ff; } }
+@media screen and (prefers-color-scheme: dark) { :root { --ink: #e6e8ea; --paper: #16191d;
+  --dim: #9aa4b0; --line: #3a414a; --good: #4fc36b; --bad: #ff7b72; --open: #e3b341;
+  --curve: #6cb2ff; } }
 @media print { :root { --ink: #000; --paper: #fff; --dim: #444; --line: #bbb; --good: #116329;
-  --bad: #a40e26; --open: #7a4d00; --curve: #0a4f96; } section, tr, svg { break-inside: avoid; } }
+  --bad: #a40e26; --open: #7a4d00; --curve: #0a4f96; } }
 body { font: 15px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper);
   max-width: 60rem; margin: 0 auto; padding: 1.5rem 1rem; overflow-wrap: anywhere; }
 h1 { margin: 0 0 .2rem; } h2 { margin: 2rem 0 .5rem; border-bottom: 1px solid var(--line); }
@@ -28,17 +29,26 @@ h1 { margin: 0 0 .2rem; } h2 { margin: 2rem 0 .5rem; border-bottom: 1px solid va
 .undecided, .unknown, .interrupted, .waiting, .running { color: var(--open); }
 table { border-collapse: collapse; width: 100%; } th { text-align: left; color: var(--dim); }
 th, td { padding: .3rem .6rem .3rem 0; border-bottom: 1px solid var(--line);
-  vertical-align: top; overflow-wrap: break-word; }
+  vertical-align: top; overflow-wrap: break-word; } td.long { overflow-wrap: anywhere; }
 @media (max-width: 40rem) { body { font-size: 13px; padding: 1rem .6rem; }
-  th, td { overflow-wrap: anywhere; padding-right: .35rem; } }
+  th, td { padding-right: .35rem; } }
 .wide { overflow-x: auto; } .wide svg { max-width: 100%; height: auto; }
+@page { size: A4; margin: 14mm; } @page turned { size: A4 landscape; margin: 12mm; }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; } .wide { overflow: visible; }
+  h2 { break-after: avoid; margin-top: 1.2rem; } tr, svg, p { break-inside: avoid; }
+  .wide svg { max-height: 24cm; } .turned { page: turned; } .turned svg { max-height: 15cm; }
+  svg, .verdict { print-color-adjust: exact; } }
 .plot .axis { stroke: var(--line); } .plot .curve { stroke: var(--curve); fill: none; }
 .plot text { fill: var(--dim); font: 11px system-ui, sans-serif; }
 """.strip()
 
 _RIGHT = {"text_anchor": "end"}
-Diagram: TypeAlias = Callable[[], str]
-"""The drawing of the diagram with the states of its elements, as SVG; it is put in as it is."""
+TURNED_FROM = 900.0
+"""Diagrams from this width on, in pixels, are printed on a page in landscape format."""
+LONG = 24
+"""Texts of more characters may be broken within words in tables."""
+Diagram: TypeAlias = Callable[[], SvgElement]
+"""Draws the diagram with the states of its elements."""
 
 
 def report_page(report: RunReport, diagram: Diagram | None = None) -> str:
@@ -47,7 +57,7 @@ def report_page(report: RunReport, diagram: Diagram | None = None) -> str:
     parts = [
         f"<h1>{escape_text(report.title)}</h1>",
         *_head(report),
-        *(_section("Diagram", _wide(diagram())) if diagram else ()),
+        *(_diagram(diagram()) if diagram else ()),
         *_section("Criteria", _criteria(report)),
         *_section("Deviations and notes", _remarks(report)),
         *_section("Steps", _steps(report)),
@@ -68,9 +78,15 @@ def _wide(content: str) -> str:
     return f'<div class="wide" tabindex="0">{content}</div>'
 
 
-def _section(name: str, content: str) -> Iterator[str]:
+def _section(name: str, content: str, kind: str = "") -> Iterator[str]:
     if content:
-        yield f"<section><h2>{name}</h2>{content}</section>"
+        start = f'<section class="{kind}">' if kind else "<section>"
+        yield f"{start}<h2>{name}</h2>{content}</section>"
+
+
+def _diagram(drawing: SvgElement) -> Iterator[str]:
+    is_wide = float(dict(drawing.attributes)["width"]) >= TURNED_FROM
+    yield from _section("Diagram", _wide(str(drawing)), "turned" if is_wide else "")
 
 
 def _head(report: RunReport) -> Iterator[str]:
@@ -114,7 +130,7 @@ def _remarks(report: RunReport) -> str:
         (_at(report, event), event.kind, names.get(event.task, ""), event.text, event.who)
         for event in report.deviations
     ]
-    return _table(("after", "", "step", "what was seen", "who"), rows)
+    return _table(("after", "kind", "step", "what was seen", "who"), rows)
 
 
 def _steps(report: RunReport) -> str:
@@ -163,7 +179,7 @@ def _events(report: RunReport) -> str:
         )
         for event in report.events
     ]
-    return _table(("", "after", "", "element", "", "who"), rows)
+    return _table(("", "after", "event", "element", "text", "who"), rows)
 
 
 def _at(report: RunReport, event: RunEvent) -> str:
@@ -193,12 +209,16 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     has_state = not heads[-1] and len(heads) > 2
     lines = []
     for row in rows:
-        cells = [f"<td>{escape_text(cell)}</td>" for cell in row]
+        cells = [f"<td{_class(cell)}>{escape_text(cell)}</td>" for cell in row]
         if has_state:
             cells[-1] = f'<td class="{escape_text(row[-1])}">{escape_text(row[-1])}</td>'
         lines.append(f"<tr>{''.join(cells)}</tr>")
     table = f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return _wide(table)
+
+
+def _class(cell: str) -> str:
+    return ' class="long"' if len(cell) > LONG else ""
 
 
 def _plot(plot: PlotData) -> str:

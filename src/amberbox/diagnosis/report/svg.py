@@ -289,9 +289,16 @@ DARK = (
 )
 
 
+_PAPER = (
+    "@page why{size:landscape;margin:10mm}"
+    "@media print{:root.why{page:why;width:100%;height:auto;max-height:95vh}}"
+)
+
+
 def style() -> str:
-    """Return the style sheet: light, and dark where the screen is."""
-    return f"{_rules(LIGHT)}@media (prefers-color-scheme:dark){{{_rules(DARK)}}}"
+    """Return the style sheet: light, and dark where the screen is; on paper as wide as that."""
+    dark = f"@media screen and (prefers-color-scheme:dark){{{_rules(DARK)}}}"
+    return f"{_rules(LIGHT)}{dark}{_PAPER}"
 
 
 def _rules(rules: Sequence[tuple[str, str]]) -> str:

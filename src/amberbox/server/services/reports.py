@@ -42,7 +42,7 @@ async def report(
     if not has_diagram:
         return await asyncio.to_thread(report_page, found)
     drawn = await asyncio.to_thread(experiments.run_diagram, fleet, robot, id)
-    return await asyncio.to_thread(report_page, found, lambda: str(drawn))
+    return await asyncio.to_thread(report_page, found, lambda: drawn)
 
 
 async def compare(

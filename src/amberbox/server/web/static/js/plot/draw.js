@@ -14,6 +14,7 @@ const COLOUR_VARIABLES = { ink: "--ink", ink2: "--ink-2", line: "--line", surfac
 export function readColours(root) {
   const probe = document.createElement("span");
   probe.hidden = true;
+  if (isPrinting) probe.style.colorScheme = "light"; // paper is
   root.append(probe);
   const read = (name) => {
     probe.style.color = `var(${name})`;
@@ -25,14 +26,18 @@ export function readColours(root) {
   return found;
 }
 
-/** Call `fn` when the theme changes, and before and after printing. @param {function(): void} fn */
+let isPrinting = false;
+addEventListener("beforeprint", () => { isPrinting = true; });
+addEventListener("afterprint", () => { isPrinting = false; });
+
+/** Call `fn` when the theme changes; also before (it has to draw at once) and after printing. @param {function(): void} fn */
 export function onThemeChange(fn, signal) {
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   dark.addEventListener("change", fn, { signal });
   const watcher = new MutationObserver(fn);
   watcher.observe(document.documentElement, { attributeFilter: ["data-theme"] });
   signal.addEventListener("abort", () => watcher.disconnect());
-  window.matchMedia("print").addEventListener("change", fn, { signal });
+  for (const event of ["beforeprint", "afterprint"]) addEventListener(event, fn, { signal });
 }
 
 /**
