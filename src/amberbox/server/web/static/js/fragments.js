@@ -28,10 +28,17 @@ export async function fetchFragment(path, options = {}) {
   return document.adoptNode(nodes.find((node) => node.nodeType === Node.ELEMENT_NODE));
 }
 
-/** Write times below an element, and label the values of its tables. @param {ParentNode} root */
+/** Write times below an element, label the values of its tables, and show its chosen tabs. @param {ParentNode} root */
 export function enhance(root = document) {
   updateTimes(root);
   labelTables(root);
+  findAll(".tabs", root).forEach(showChosenTab);
+}
+
+/** Scroll tabs that are wider than the screen so that the chosen one is in sight. */
+function showChosenTab(tabs) {
+  const chosen = find("[aria-current], [aria-selected='true']", tabs);
+  if (chosen) tabs.scrollLeft = chosen.offsetLeft - tabs.offsetLeft - (tabs.clientWidth - chosen.offsetWidth) / 2;
 }
 
 /**

@@ -8,6 +8,7 @@ import { t } from "./strings.js";
 import { secondsParam, stampToSeconds } from "./time.js";
 
 const SHOWN_S = 600;
+const [SIZE, THRESHOLD] = [0, 1]; // colours, the same in each plot
 
 const { robot, model, residuals } = pageData("residuals-about");
 loadItems(robot).then(draw).catch(() => draw([]));
@@ -22,16 +23,16 @@ function draw(items) {
   const window = { from: Math.max(to - SHOWN_S, Math.min(first, to - 1)), to };
   const stack = plots(find("#residual-plots"), { ...window, whole: window, fixed: true });
   for (const one of residuals) {
-    stack.add(curve(one, one.name, (...args) => sizes(one, ...args)));
+    stack.add(curve(one, one.name, SIZE, (...args) => sizes(one, ...args)));
     for (const sign of one.threshold === null ? [] : [1, -1]) {
       const label = t(sign > 0 ? "models.above" : "models.below");
-      stack.add(curve(one, label, (from, to) => constant(from, to, sign * one.threshold)));
+      stack.add(curve(one, label, THRESHOLD, (from, to) => constant(from, to, sign * one.threshold)));
     }
   }
 }
 
-function curve(one, label, request) {
-  return { id: `${one.name} ${label}`, robot, item: one.item, variable: one.name, label, panel: one.name, request };
+function curve(one, label, colour, request) {
+  return { colour, id: `${one.name} ${label}`, robot, item: one.item, variable: one.name, label, panel: one.name, request };
 }
 
 /** Load the size of a residual. @returns {Promise<import("./plot/series.js").Series>} */

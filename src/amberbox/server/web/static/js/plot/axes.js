@@ -62,11 +62,15 @@ function splitSeconds(time, digits) {
   return [whole, `.${String(rounded - whole * scale).padStart(digits, "0")}`];
 }
 
-const AXIS_WIDTH = 76;
-const NARROW_AXIS_WIDTH = 56;
-export const TIME_HEIGHT = 44;
-const LABEL_SIZE = 16;
-const FONT = "12px system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif";
+// lengths are for a page whose font is 16 px, and grow with it, as on wall screens
+const SCALE = Math.max(1, parseFloat(getComputedStyle(document.documentElement).fontSize) / 16);
+/** Return a length on a canvas in pixels. @param {number} length at a font of 16 px */
+export const scaled = (length) => Math.round(length * SCALE);
+const AXIS_WIDTH = scaled(76);
+const NARROW_AXIS_WIDTH = scaled(56);
+export const TIME_HEIGHT = scaled(44);
+const LABEL_SIZE = scaled(16);
+export const FONT = `${scaled(12)}px system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif`;
 const SINCE_STEPS = [
   1e-6, 1e-5, 1e-4, 1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60,
   120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400, 172800, 604800,
@@ -80,7 +84,7 @@ export function timeAxis({ relative, ink, line, hasLabels }) {
   const values = (_, times, __, ___, step) =>
     relative ? times.map((time) => elapsed(time, step)) : clockLabels(times, step);
   return {
-    scale: "x", side: 2, size: hasLabels ? TIME_HEIGHT : 8, space: relative ? 70 : 84, font: FONT,
+    scale: "x", side: 2, size: hasLabels ? TIME_HEIGHT : 8, space: scaled(relative ? 70 : 84), font: FONT,
     gap: 9, stroke: ink, grid: { stroke: line, width: 1 }, ticks: { show: false },
     values: hasLabels ? values : (_, times) => times.map(() => ""),
     ...(relative ? { incrs: SINCE_STEPS } : {}),
@@ -98,7 +102,7 @@ export function valueAxis({ scale, unit, first, narrow, words: names, ink, line 
     size: axisWidth(narrow) - (unit ? LABEL_SIZE : 0), grid: { show: first, stroke: line, width: 1 },
     label: escapeHidden(unit) || undefined, labelSize: LABEL_SIZE, labelFont: FONT, labelGap: 0,
   };
-  if (!names.length) return { ...common, space: 34, values: (_, v, __, ___, s) => axisNumbers(v, s) };
+  if (!names.length) return { ...common, space: scaled(34), values: (_, v, __, ___, s) => axisNumbers(v, s) };
   const labels = shortenNames(names.map((word) => word && escapeHidden(word)), narrow ? 6 : 9);
   return {
     ...common,

@@ -4,15 +4,14 @@ import { latestSignal, requestColumns, requestJson, robotApi } from "../api.js";
 import { el, escapeHidden, setText, setTextAttribute } from "../dom.js";
 import { t } from "../strings.js";
 import { secondsParam } from "../time.js";
-import { dateTime, numberText } from "./axes.js";
+import { dateTime, FONT, numberText, scaled } from "./axes.js";
 import { onThemeChange, readColours } from "./draw.js";
 import { firstIndexFrom, indexAt, seriesOf } from "./series.js";
 
-const LEFT = 64;
+const LEFT = scaled(64);
 const RIGHT = 16;
 const TOP = 12;
-const BOTTOM = 44;
-const FONT = "12px system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif";
+const BOTTOM = scaled(44);
 const STEPS = [1, 2, 2.5, 5, 10];
 const MARGIN = 0.05;
 
@@ -71,19 +70,19 @@ function drawAxes(context, shades, width, height, x, y) {
   context.fillStyle = shades.ink;
   context.lineWidth = 1;
   const names = x.names && new Map(x.names);
-  for (const value of names?.keys() ?? ticks(x.low, x.high, (right - LEFT) / 80)) {
+  for (const value of names?.keys() ?? ticks(x.low, x.high, (right - LEFT) / scaled(80))) {
     const at = Math.round(place.x(value)) + 0.5;
     drawRule(context, at, TOP, at, bottom);
-    writeText(context, names?.get(value) ?? numberText(value), at, bottom + 16, "center");
+    writeText(context, names?.get(value) ?? numberText(value), at, bottom + scaled(16), "center");
   }
-  for (const value of ticks(y.low, y.high, (bottom - TOP) / 34)) {
+  for (const value of ticks(y.low, y.high, (bottom - TOP) / scaled(34))) {
     const at = Math.round(place.y(value)) + 0.5;
     drawRule(context, LEFT, at, right, at);
-    writeText(context, numberText(value), LEFT - 6, at + 4, "right");
+    writeText(context, numberText(value), LEFT - 6, at + scaled(4), "right");
   }
   writeText(context, x.label, (LEFT + right) / 2, height - 8, "center");
   context.save();
-  context.translate(12, (TOP + bottom) / 2);
+  context.translate(scaled(12), (TOP + bottom) / 2);
   context.rotate(-Math.PI / 2);
   writeText(context, y.label, 0, 0, "center");
   context.restore();

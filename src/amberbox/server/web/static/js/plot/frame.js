@@ -22,6 +22,7 @@ function valueTable(stack) {
 
 /** Update the rows of the table. */
 export function updateValueTable(table, traces, time) {
+  table.root.classList.toggle("is-bare", traces.length > 0 && traces.every((trace) => trace.request)); // these have no statistics
   for (const [id, row] of table.rows) {
     if (traces.some((trace) => trace.id === id)) continue;
     row.root.remove();

@@ -196,6 +196,7 @@ function watchSize(stack, signal) {
  * @property {number} [origin] seconds that are the zero of its time axis (0)
  * @property {boolean} [isArchived] false for one of which there are live values only
  * @property {number} [length] seconds after `origin` that are shown, of a mission; else all
+ * @property {number} [colour] which of the colours of curves, from 0; else one that is free
  * @property {function(number, number, number, AbortSignal): Promise<any>} [request] loads the series
  *   of what is computed: from, to (s), points; `item` is then what it is computed from
  */
@@ -233,7 +234,7 @@ export function plots(element, options) {
   listenForInput(stack.frame.plots, stack, end.signal);
   onThemeChange(() => {
     stack.colours.now = readColours(stack.frame.root);
-    stack.redraw();
+    drawAll(stack);
   }, end.signal);
   watchSize(stack, end.signal);
   return publicApi(stack, end);

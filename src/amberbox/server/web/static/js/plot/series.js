@@ -219,17 +219,17 @@ export function kindOf(column) {
 }
 
 /**
- * Make the trace of a variable, with a free colour and the names of its values.
+ * Make the trace of a variable, with a free colour (or that of the options) and the names of its values.
  * @param {import("./plot.js").TraceOptions} options @param {Set<number>} used colours that are taken
  * @returns {import("./panel.js").Trace}
  */
 export function traceOf(options, used) {
-  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0, length = null, isArchived = true, request = null } = options;
+  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0, length = null, isArchived = true, request = null, colour = freeColour(used) } = options;
   const kind = options.kind ?? kindOf({ type: "", labels });
   const { codes, names } = namesOf(kind, labels);
   return {
     id, robot, item, variable, label, unit, kind, origin, length, isArchived, request, codes, names, panel: options.panel ?? id,
-    colour: freeColour(used), series: null, live: null, widest: null, statistics: null, problem: null, asked: null,
+    colour, series: null, live: null, widest: null, statistics: null, problem: null, asked: null,
   };
 }
 
