@@ -31,7 +31,7 @@ from tests.support.commands import ANNA
 from tests.support.processes import wait_for, wait_for_listener
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Locator, Page
 
 PHONE = 390
 SAMPLES = Path(amberbox.sim.__file__).parent / "folder"
@@ -165,6 +165,45 @@ def test_two_people_run_an_experiment(page_as: PageAs, world: Commanded, tmp_pat
         expect(report).to_contain_text(text)
     assert desk.evaluate("() => getComputedStyle(document.querySelector('.verdict')).fontWeight") \
         == "600"  # fmt: skip
+
+
+def tab_to(page: Page, element: Locator) -> None:
+    """Press Tab until an element has the focus, which has to be visible."""
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if element.evaluate("(one) => one === document.activeElement"):
+            outline = "(one) => getComputedStyle(one.closest('.choice') ?? one).outlineStyle"
+            own = element.evaluate("(one) => getComputedStyle(one).outlineStyle")
+            assert {own, element.evaluate(outline)} != {"none"}, "the focus cannot be seen"
+            return
+    raise AssertionError(f"Tab does not lead to {element}")
+
+
+def test_a_step_is_done_with_the_keyboard_alone(page_as: PageAs, world: Commanded) -> None:
+    desk = opened(page_as, world, "anna", f"/robots/{ROBOT}/experiments/wheel_check")
+    run = started(desk)
+    desk.context.close()
+    page = opened(page_as, world, "olga", "/tasks")
+    tab_to(page, page.get_by_text("Something is not as expected"))
+    page.keyboard.press("Enter")
+    tab_to(page, page.get_by_label("What is it?"))
+    page.keyboard.type("A cart stands near the way.")
+    tab_to(page, page.get_by_role("button", name="Note the deviation"))
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("olga noted: A cart stands near the way.")).to_be_visible()
+    page.keyboard.press("Control+Home")
+    page.evaluate("document.activeElement.blur()")
+    tab_to(page, page.get_by_role("radio", name="Pass"))
+    page.keyboard.press("Space")
+    tab_to(page, page.get_by_role("button", name="Done"))
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="Drive the distance")).to_be_visible()
+    focused = "() => document.activeElement.closest('#task-parts') !== null"
+    page.wait_for_function(focused)
+    tab_to(page, page.get_by_role("button", name="Abort experiment"))
+    page.keyboard.press("Enter")
+    with world.fleet() as fleet:
+        wait_for(lambda: fleet.run(ROBOT, run).run.state == "aborted", "the end of the run")
 
 
 def test_steps_and_abort_work_without_scripts(page_as: PageAs, world: Commanded) -> None:

@@ -521,7 +521,7 @@ class FaultStory:
         """Describe each robot that is offline or not well."""
         cards = {card["robot"]: card for card in self.browser.get("/robots")}
         return [
-            f"{robot}: {cards[robot]['cause']} {cards[robot]['components']}"
+            f"{robot}: {cards[robot]['cause']}{_counted(cards[robot]['components'])}"
             for robot in IDS
             if not _is_well(cards[robot])
         ]
@@ -729,6 +729,11 @@ class ExperimentStory:
         ended = self._detail_of_run()["run"]["ended"]
         since = f"/robots/{DRIVER}/missions?name=delivery&from={ended}"
         return (ended and bool(self.browser.get(since))) or None
+
+
+def _counted(levels: Mapping[str, int]) -> str:
+    """Return how many components have which level, in brackets; "" while none is known."""
+    return f" ({', '.join(f'{n} {level}' for level, n in levels.items())})" if levels else ""
 
 
 def _is_well(card: Any) -> bool:

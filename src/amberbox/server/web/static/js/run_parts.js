@@ -37,6 +37,7 @@ export function keepRunCurrent(id, { address, robots, run, robot, role, placed =
       if (!fresh) throw new ApiError(find(".problem strong", page)?.textContent ?? t("common.unreachable"), find(".problem p", page)?.textContent ?? "", 0);
       placeParts(parts(), document.adoptNode(fresh), form.id); // another may have taken its place meanwhile
       announce();
+      if (document.activeElement === document.body) focusStep(parts()); // what had the focus is gone
       find(`#${id} [role="alert"]`)?.scrollIntoView({ block: "nearest" });
     });
     if (error?.status === 0) showError(new ApiError(t("runs.kept"), "", 0), form.isConnected ? form : null);
@@ -60,6 +61,13 @@ export function keepRunCurrent(id, { address, robots, run, robot, role, placed =
   setInterval(bePresent, PRESENT_MS);
   document.addEventListener("visibilitychange", bePresent);
   return { feed, bePresent };
+}
+
+/** Put the focus on the step that is shown now, so that the next Tab is inside it. */
+function focusStep(parts) {
+  const step = find(".run-step", parts) ?? parts;
+  step.tabIndex = -1;
+  step.focus({ preventScroll: true });
 }
 
 /** Send a plain form as the browser would; return the page that answers. Throws ApiError. */
