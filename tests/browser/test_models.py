@@ -60,11 +60,24 @@ def test_residuals_are_drawn_over_the_record(page_as: PageAs) -> None:
     expect(page.locator("#residual-plots canvas")).to_have_count(1)  # the other cannot be computed
     drawn = page.locator("#residual-plots")
     expect(drawn.get_by_role("group").get_by_text("threshold", exact=True)).to_be_visible()
+    swatches = drawn.locator(".plot-readout .plot-swatch")
+    size, above, below = swatches.evaluate_all("(all) => all.map((one) => one.style.background)")
+    assert size != above == below, "thresholds have a colour of their own"
+    expect(drawn.get_by_role("columnheader", name="Drawn")).to_be_visible()
+    expect(drawn.get_by_role("columnheader", name="Mean")).to_have_count(0)  # there are none
     for theme, width in LOOKS:
         with look(page, theme, width):
             no_sideways_scroll(page)
             shot(page, "model-residuals")
     axe(page)
+
+
+def test_the_chosen_tab_is_in_sight_on_a_phone(page_as: PageAs) -> None:
+    page = page_as("viewer", 390)
+    page.goto("/robots/ropod_001/models/motion?show=residuals")
+    chosen = page.get_by_role("link", name="Residuals", exact=True)
+    expect(chosen).to_have_attribute("aria-current", "page")
+    expect(chosen).to_be_in_viewport(ratio=0.95)
 
 
 @pytest.mark.parametrize("path", ["large?q=equation_1", "power", "odd?show=faults"])

@@ -7,7 +7,7 @@ from playwright.sync_api import expect
 from amberbox.core.safe_text import escape_hidden
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import axe, shot
+from tests.browser.page_checks import EVERY_LOOK, judge, shot
 from tests.browser.site import Site
 from tests.browser.test_data import VOLTS, open_data, stamp
 
@@ -20,8 +20,7 @@ def test_a_moment_is_annotated_where_no_mission_was_under_way(page_as: PageAs, s
     expect(dialog.get_by_role("button", name="Add", exact=True)).to_be_enabled()
     expect(dialog.get_by_role("combobox", name="Mission")).to_be_hidden()
     dialog.get_by_role("textbox", name="Note").fill(hostile.NOTE)
-    axe(page)
-    shot(page, "note-dialog")
+    judge(page, "note-dialog", EVERY_LOOK, whole=False)
     dialog.get_by_role("button", name="Add", exact=True).click()
     expect(page.get_by_text("The note is added.")).to_be_visible()
     expect(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 EXPERIMENT = Path(amberbox.sim.__file__).parent / "folder/experiments/cart_transport.bpmn"
 A4_PX = 718  # a page of 210 mm with margins of 10 mm, in pixels
 INK = "rgb(31, 34, 38)"
-_CUT = """() => [...document.querySelectorAll("main *, body > section *")].filter((one) =>
+_CUT = """() => [...document.querySelectorAll("main *")].filter((one) =>
     one.checkVisibility() && one.clientWidth && getComputedStyle(one).overflowX !== "visible"
     && one.scrollWidth > one.clientWidth + 1
     && !one.matches(".clip, .clip *, .sr-only, thead, input")

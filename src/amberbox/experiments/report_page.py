@@ -45,6 +45,7 @@ th, td { padding: .3rem .6rem .3rem 0; border-bottom: 1px solid var(--line);
 _RIGHT = {"text_anchor": "end"}
 TURNED_FROM = 900.0
 """Diagrams from this width on, in pixels, are printed on a page in landscape format."""
+STATE, VERDICT = "state", "verdict"
 LONG = 24
 """Texts of more characters may be broken within words in tables."""
 Diagram: TypeAlias = Callable[[], SvgElement]
@@ -69,7 +70,7 @@ def report_page(report: RunReport, diagram: Diagram | None = None) -> str:
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape_text(name)}</title><style>{_STYLE}</style></head>\n"
-        f"<body>\n{chr(10).join(parts)}\n</body></html>\n"
+        f"<body><main>\n{chr(10).join(parts)}\n</main></body></html>\n"
     )
 
 
@@ -112,7 +113,7 @@ def _criteria(report: RunReport) -> str:
         )
         for one in report.criteria
     ]
-    return _table(("criterion", "measured", "expected", "during", ""), rows)
+    return _table(("criterion", "measured", "expected", "during", VERDICT), rows)
 
 
 def _value(value: float, unit: str) -> str:
@@ -146,7 +147,7 @@ def _steps(report: RunReport) -> str:
         )
         for number, step in enumerate(report.steps, 1)
     ]
-    return _table(("", "step", "who", "after", "took", "what came of it", ""), rows)
+    return _table(("no.", "step", "who", "after", "took", "what came of it", STATE), rows)
 
 
 def _came_of(step: StepRecord) -> str:
@@ -179,7 +180,7 @@ def _events(report: RunReport) -> str:
         )
         for event in report.events
     ]
-    return _table(("", "after", "event", "element", "text", "who"), rows)
+    return _table(("no.", "after", "event", "element", "text", "who"), rows)
 
 
 def _at(report: RunReport, event: RunEvent) -> str:
@@ -202,11 +203,11 @@ def _list(texts: Iterable[str]) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table; a last column without a head is a state, which has its colour."""
+    """Return a table; a last column that is a state or a verdict has its colour."""
     if not rows:
         return ""
     top = "".join(f"<th>{head}</th>" for head in heads) if any(heads) else ""
-    has_state = not heads[-1] and len(heads) > 2
+    has_state = heads[-1] in (STATE, VERDICT)
     lines = []
     for row in rows:
         cells = [f"<td{_class(cell)}>{escape_text(cell)}</td>" for cell in row]
