@@ -22,8 +22,11 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.core.types import Symptom
+from amberbox.diagnosis.covering.model import Model
+from amberbox.diagnosis.covering.observations import Evidence as Counted
+from amberbox.diagnosis.diagnose import ObservedSituation, evidence_of_situation
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.symptom_presence import Counts
 from amberbox.diagnosis.tracker import FaultTracker
 from amberbox.monitoring.engine import Engine
 from amberbox.monitoring.record_evaluation import DiagnosedEngine
@@ -35,7 +38,7 @@ from benchmarks.diagnosis import FIRST_SEED, Job, described, kept, mission_of, p
 from benchmarks.missions import Batches, Mission, Planted, live, mode_of, seconds_of
 
 TOLERANCE_S = 1.0
-"""Changes of a symptom that are no further apart than this count as simultaneous."""
+"""How far the onset of a symptom may differ of which the FMEA states how soon it shows."""
 MAGNITUDES = 3
 """How many magnitudes of a fault's range are tried."""
 TWINS = 4
@@ -47,93 +50,130 @@ Verdict: TypeAlias = Literal["shows nothing", "looks like another", "left"]
 # -- evidence
 
 
-class Change(NamedTuple):
-    """A change of a symptom: when it was known, and all that a diagnosis can use of it."""
+class Shown(NamedTuple):
+    """What the engine reads of a symptom that counts as present."""
 
-    at_s: float
-    onset_s: float | None
-    state: str
+    onset_s: float
     level: int | None
     strength: float
-    blocked_by: tuple[str, ...]
-
-    def is_like(self, other: Change) -> bool:
-        """Tell whether nothing but up to ``TOLERANCE_S`` of time distinguishes two changes."""
-        return (
-            self[2:] == other[2:]
-            and abs(self.at_s - other.at_s) <= TOLERANCE_S
-            and (self.onset_s is None) == (other.onset_s is None)
-            and abs((self.onset_s or 0.0) - (other.onset_s or 0.0)) <= TOLERANCE_S
-        )
 
     def __str__(self) -> str:
         size = "" if self.level is None else f", size in level {self.level}"
-        blocked = f", blocked by {' and '.join(self.blocked_by)}" if self.blocked_by else ""
-        return f"{self.state} at {self.at_s:.1f} s{size}{blocked}"
+        return f"present since {self.onset_s:.1f} s{size}"
 
 
-Evidence: TypeAlias = dict[str, list[Change]]
+@dataclass(slots=True)
+class Evidence:
+    """The evidence that the answer of a mission is a function of.
+
+    ``shown`` are the symptoms that counted as present at any time, as they did last. ``counts`` are
+    those that count at the last question to the engine, with state and strength. ``answer`` is the
+    first group of what is shown at the end, the leading set of faults first.
+    """
+
+    shown: dict[str, Shown] = field(default_factory=dict)
+    counts: dict[str, tuple[str, float]] = field(default_factory=dict)
+    answer: tuple[str, ...] = ()
+
+
 Observer: TypeAlias = Callable[[Mission], Iterator[tuple[float, Evidence]]]
 
 
+class WitnessedTracker(FaultTracker):
+    """A tracker that keeps the evidence of all questions that it asks the engine."""
+
+    def __init__(self, knowledge: Knowledge) -> None:
+        super().__init__(knowledge)
+        self._found = Evidence()
+
+    def evidence(self) -> Evidence:
+        """Return the evidence so far, and the answer that is shown now."""
+        made = self.current()
+        if made is None:
+            return replace(self._found, answer=())
+        first, *others = made.groups[0].members
+        return replace(self._found, answer=(first, *sorted(others)))
+
+    def _situation(self, counting: Mapping[str, Counts]) -> ObservedSituation:
+        asked = super()._situation(counting)
+        note(self._found, evidence_of_situation(self.knowledge, asked), self.knowledge.model)
+        return asked
+
+
 def observe(mission: Mission) -> Iterator[tuple[float, Evidence]]:
-    """Yield until when the symptoms of a mission are known, s, and their changes so far."""
+    """Yield until when a mission is known, s, and its evidence so far."""
     at = world()
-    watcher = DiagnosedEngine(Engine(at.plan), FaultTracker(at.knowledge))
+    tracker = WitnessedTracker(at.knowledge)
+    watcher = DiagnosedEngine(Engine(at.plan), tracker)
     watcher.begin(START_NS)
     batches = Batches(at.wanted)
-    found: Evidence = {}
     for until_s, messages in live(mission):
         for batch in batches.of(messages):
             watcher.feed(batch)
-        for each in watcher.advance(START_NS + round(until_s * NS)):
-            if isinstance(each, Symptom):
-                note(found, each, at.knowledge)
-        yield until_s, found
+        watcher.advance(START_NS + round(until_s * NS))
+        yield until_s, tracker.evidence()
 
 
-def note(found: Evidence, symptom: Symptom, knowledge: Knowledge) -> None:
-    """Add what a symptom says, if it is news."""
-    known_ns = symptom.confirmed_ns or symptom.onset_ns
-    assert known_ns is not None, "the engine states when it knew"
-    onset_s = None if symptom.onset_ns is None else seconds_of(symptom.onset_ns)
-    change = Change(
-        seconds_of(known_ns),
-        onset_s,
-        symptom.state,
-        knowledge.level(symptom) if symptom.state == "present" else None,
-        symptom.strength,
-        tuple(sorted(symptom.blocked_by)),
-    )
-    changes = found.setdefault(symptom.id, [])
-    if not changes or changes[-1][1:] != change[1:]:
-        changes.append(change)
+def note(found: Evidence, asked: Counted, model: Model) -> None:
+    """Add the evidence of a question; symptoms that the model lacks are none."""
+    found.counts.clear()
+    for name, observation in asked.observations.items():
+        if name in model.sign_places:
+            found.counts[name] = observation.state, observation.strength
+            if observation.state == "present":
+                onset_s = seconds_of(asked.onsets_ns.get(name, START_NS))
+                found.shown[name] = Shown(onset_s, observation.level, observation.strength)
 
 
-def difference(one: Evidence, other: Evidence, until_s: float) -> tuple[float, str] | None:
-    """Return the first difference between two missions, known until so many seconds; None if none.
+@dataclass(frozen=True)
+class Timing:
+    """How far onsets may differ, s: of symptoms that some cause times with ``after_s``, of others.
+
+    Those of others say no more than whether faults began together.
+    """
+
+    timed: frozenset[str] = frozenset()
+    timed_s: float = TOLERANCE_S
+    together_s: float = 10.0
+
+    @classmethod
+    def of(cls, knowledge: Knowledge) -> Timing:
+        """Return what the engine reads of onsets."""
+        model = knowledge.model
+        timed = frozenset(model.signs[place].id for place in model.tables.timed)
+        return cls(timed, together_s=knowledge.fmea.other.together_s)
+
+
+def difference(
+    one: Evidence, other: Evidence, end_s: float, timing: Timing = Timing()
+) -> tuple[float, str] | None:
+    """Return the first difference between two missions that end; None if there is none.
 
     It is when it begins, s, and what it is as text.
     """
-    found = (_first_of(name, one, other, until_s) for name in sorted({*one, *other}))
-    return min((each for each in found if each is not None), default=None)
-
-
-def _first_of(
-    name: str, one: Evidence, other: Evidence, until_s: float
-) -> tuple[float, str] | None:
-    mine, others = one.get(name, []), other.get(name, [])
-    for n in range(max(len(mine), len(others))):
-        here = mine[n] if n < len(mine) else None
-        there = others[n] if n < len(others) else None
-        if here and there and here.is_like(there):
-            continue
-        at_s = min(each.at_s for each in (here, there) if each)
-        # What the other mission has may still come, until the tolerance is over.
-        if at_s > until_s - TOLERANCE_S and not (here and there):
-            return None
-        return at_s, f"{name}: {here or 'no change'}, with the twin {there or 'no change'}"
+    names = sorted({*one.shown, *other.shown})
+    found = [each for name in names if (each := _shown_otherwise(name, one, other, timing))]
+    if found:
+        return min(found)
+    for name, _ in sorted(one.counts.items() ^ other.counts.items()):
+        here, there = (each.counts.get(name, ("no evidence",))[0] for each in (one, other))
+        return end_s, f"{name}: {here} at the end, with the twin {there}"
+    if one.answer != other.answer:
+        here, there = (" or ".join(each.answer) or "none" for each in (one, other))
+        return end_s, f"the same evidence, but the answer is {here}, with the twin {there}"
     return None
+
+
+def _shown_otherwise(
+    name: str, one: Evidence, other: Evidence, timing: Timing
+) -> tuple[float, str] | None:
+    here, there = one.shown.get(name), other.shown.get(name)
+    if here and there and here[1:] == there[1:]:
+        within_s = timing.timed_s if name in timing.timed else timing.together_s
+        if abs(here.onset_s - there.onset_s) <= within_s:
+            return None
+    at_s = min(each.onset_s for each in (here, there) if each)
+    return at_s, f"{name}: {here or 'not present'}, with the twin {there or 'not present'}"
 
 
 # -- twins
@@ -230,13 +270,17 @@ class Proof:
 
 
 def prove(
-    outcome: Outcome, mission: Mission, twins: Iterable[Twin], observer: Observer = observe
+    outcome: Outcome,
+    mission: Mission,
+    twins: Iterable[Twin],
+    observer: Observer = observe,
+    timing: Timing = Timing(),
 ) -> Proof:
     """Look for a twin with the same evidence as a mission that was missed."""
     mine = [found for _, found in observer(mission)][-1]
     found: list[tuple[float, str, str]] = []
     for twin in twins:
-        differs = _differs(mine, twin.mission, observer)
+        differs = _differs(mine, twin.mission, observer, timing)
         if differs is None:
             return Proof(outcome.kind, outcome.seed, outcome.faults, twin.verdict, twin.what)
         found.insert(0, (differs[0], twin.what, differs[1]))
@@ -245,15 +289,15 @@ def prove(
     return Proof(outcome.kind, outcome.seed, outcome.faults, differences=differences)
 
 
-def _differs(mine: Evidence, mission: Mission, observer: Observer) -> tuple[float, str] | None:
-    """Return the first difference of a twin; it is not simulated for longer than needed."""
-    others: Evidence = {}
-    for until_s, others in observer(mission):
-        differs = difference(mine, others, until_s)
-        if differs is not None:
-            return differs
-    # At the end, what has not come will not come.
-    return difference(mine, others, mission.seconds + TOLERANCE_S)
+def _differs(
+    mine: Evidence, mission: Mission, observer: Observer, timing: Timing
+) -> tuple[float, str] | None:
+    """Return the first difference of a twin; it is not simulated on when it shows more."""
+    others = Evidence()
+    for _, others in observer(mission):
+        if others.shown.keys() - mine.shown.keys():
+            break
+    return difference(mine, others, mission.seconds, timing)
 
 
 def work(outcome: Outcome, first_seed: int, twins: int) -> Proof:
@@ -263,7 +307,8 @@ def work(outcome: Outcome, first_seed: int, twins: int) -> Proof:
         what = f"{outcome.kind} {outcome.seed} is {', '.join(described(mission))} here"
         raise UsageError(what, "give the --first-seed of the scoring, and its state of the code")
     alike = alike_twins(mission, outcome.group, planted_modes())
-    return prove(outcome, mission, [*silent_twins(mission), *islice(alike, twins)])
+    tried = [*silent_twins(mission), *islice(alike, twins)]
+    return prove(outcome, mission, tried, timing=Timing.of(world().knowledge))
 
 
 def planted_modes() -> dict[str, SimulatedFault]:

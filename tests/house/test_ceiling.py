@@ -8,17 +8,23 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
 
+from amberbox.core.types import Diagnosis
+from amberbox.diagnosis.diagnose import DiagnosisId, answer
 from amberbox.sim.faults import SimulatedFault, catalogue
 from benchmarks import ceiling
 from benchmarks.accuracy import Outcome, with_figures
 from benchmarks.ceiling import (
     MAGNITUDES,
     MARKS,
-    Change,
     Evidence,
     Observer,
     Proof,
+    Shown,
+    Timing,
+    WitnessedTracker,
     alike_twins,
     ceiling_table,
     difference,
@@ -28,7 +34,9 @@ from benchmarks.ceiling import (
     prove,
     silent_twins,
 )
+from benchmarks.diagnosis import world
 from benchmarks.missions import Mission, Planted
+from tests.diagnosis.tracker.robot import T0_NS, At, knowledge, run
 from tools.findings import ROOT
 
 END_S = 120.0
@@ -51,8 +59,8 @@ def mission(*names: str) -> Mission:
     return Mission(7, "transport", False, tuple(planted), END_S)
 
 
-def shown(at_s: float, state: str = "present", level: int | None = None) -> Change:
-    return Change(at_s, at_s, state, level, 1.0, ())
+def shown(onset_s: float, level: int | None = None) -> Shown:
+    return Shown(onset_s, level, 1.0)
 
 
 def observer(fmea: Mapping[str, Sequence[str]], delay_s: Mapping[str, float]) -> Observer:
@@ -60,12 +68,12 @@ def observer(fmea: Mapping[str, Sequence[str]], delay_s: Mapping[str, float]) ->
 
     def watch(of: Mission) -> Iterator[tuple[float, Evidence]]:
         for until_s in (60.0, END_S):
-            found: Evidence = {}
+            found = Evidence()
             for planted in of.faults:
                 for symptom in fmea[planted.fault.id]:
                     at_s = planted.at_s + delay_s.get(planted.fault.id, 1.0)
-                    if at_s <= until_s and symptom not in found:
-                        found[symptom] = [shown(at_s)]
+                    if at_s <= until_s:
+                        found.shown.setdefault(symptom, shown(at_s))
             yield until_s, found
 
     return watch
@@ -78,7 +86,8 @@ def proven(
     at = mission(*names)
     faults = {name: fault(name) for name in FMEA}
     twins = [*silent_twins(at), *alike_twins(at, group, faults)]
-    return prove(Outcome(kind, 7, [], list(names)), at, twins, observer(FMEA, delay_s))
+    of = Outcome(kind, 7, [], list(names))
+    return prove(of, at, twins, observer(FMEA, delay_s), Timing(frozenset({"laser/range"})))
 
 
 def test_a_fault_that_shows_nothing_is_proven() -> None:
@@ -98,18 +107,18 @@ def test_what_can_be_told_apart_is_left_with_the_first_difference() -> None:
     proof = proven(["crash"], ["blocked"])
     assert proof.verdict == "left" and not proof.twin
     assert proof.nearest.startswith("blocked=")
-    assert proof.nearest.endswith("laser/process: present at 31.0 s, with the twin no change")
+    assert proof.nearest.endswith("laser/process: present since 31.0 s, with the twin not present")
     assert proven(["weak"], ["blocked"]).verdict == "left"
     late = proven(["blocked"], ["dirty"], dirty=2.5)
-    assert late.verdict == "left" and "with the twin present at 32.5 s" in late.nearest
+    assert late.verdict == "left" and "with the twin present since 32.5 s" in late.nearest
     last = proven(["blocked"], ["dirty"], dirty=1.0, blocked=END_S - 30.0)
     assert last.verdict == "left"  # what the last second shows counts, too
 
 
 def test_answers_that_cannot_be_made_have_no_twin() -> None:
     faults = {name: fault(name) for name in FMEA}
-    for answer in (["unknown#other"], ["weak", "base#no_such_mode"], ["blocked"], []):
-        assert not list(alike_twins(mission("blocked", "weak"), [answer], faults))
+    for group in (["unknown#other"], ["weak", "base#no_such_mode"], ["blocked"], []):
+        assert not list(alike_twins(mission("blocked", "weak"), [group], faults))
 
 
 def test_magnitudes_and_onsets_of_twins() -> None:
@@ -128,28 +137,114 @@ def test_magnitudes_and_onsets_of_twins() -> None:
 @pytest.mark.parametrize(
     ("other", "is_same"),
     [
-        ([shown(30.9, level=3), shown(50.0, "absent")], True),
-        ([shown(31.1, level=3), shown(50.0, "absent")], False),
-        ([shown(30.0, level=4), shown(50.0, "absent")], False),
-        ([shown(30.0, level=3)._replace(blocked_by=("base",)), shown(50.0, "absent")], False),
-        ([shown(30.0, level=3)._replace(onset_s=20.0), shown(50.0, "absent")], False),
-        ([shown(30.0, level=3)._replace(strength=0.5), shown(50.0, "absent")], False),
-        ([shown(30.0, level=3), shown(50.0, "unknown")], False),
-        ([shown(30.0, level=3)], False),
-        ([], False),
+        (Evidence({"a/b": shown(30.9, 3)}, {"c/d": ("absent", 1.0)}), True),
+        (Evidence({"a/b": shown(31.1, 3)}, {"c/d": ("absent", 1.0)}), False),
+        (Evidence({"a/b": shown(30.0, 4)}, {"c/d": ("absent", 1.0)}), False),
+        (Evidence({"a/b": Shown(30.0, 3, 0.5)}, {"c/d": ("absent", 1.0)}), False),
+        (Evidence({"a/b": shown(30.0, 3)}, {"c/d": ("absent", 0.5)}), False),
+        (Evidence({"a/b": shown(30.0, 3)}), False),
+        (Evidence({}, {"c/d": ("absent", 1.0)}), False),
     ],
 )
-def test_what_counts_as_the_same(other: list[Change], is_same: bool) -> None:
-    said = {"a/b": [shown(30.0, level=3), shown(50.0, "absent")]}
-    assert (difference(said, {"a/b": other}, END_S) is None) == is_same
-    assert (difference({"a/b": other}, said, END_S) is None) == is_same
+def test_what_counts_as_the_same(other: Evidence, is_same: bool) -> None:
+    said = Evidence({"a/b": shown(30.0, 3)}, {"c/d": ("absent", 1.0)})
+    timing = Timing(frozenset({"a/b"}))
+    assert (difference(said, other, END_S, timing) is None) == is_same
+    assert (difference(other, said, END_S, timing) is None) == is_same
 
 
-def test_what_may_still_come_is_no_difference_yet() -> None:
-    said = {"a/b": [shown(59.5)]}
-    assert difference(said, {}, 60.0) is None
-    found = difference(said, {}, 61.0)
-    assert found is not None and found[0] == 59.5
+def test_an_onset_that_no_cause_times_says_only_what_began_together() -> None:
+    said = Evidence({"a/b": shown(30.0)})
+    assert difference(said, Evidence({"a/b": shown(39.0)}), END_S) is None
+    assert difference(said, Evidence({"a/b": shown(41.0)}), END_S) is not None
+
+
+def test_another_answer_to_the_same_evidence_is_no_proof() -> None:
+    """The tracker keeps an answer whose symptoms only fade: what was before may speak for it."""
+    one, other = Evidence(answer=("x#a",)), Evidence(answer=("x#b",))
+    found = difference(one, other, END_S)
+    assert found == (END_S, "the same evidence, but the answer is x#a, with the twin x#b")
+
+
+SMALL = knowledge("""\
+defaults: {detects: 0.9, leak: 0.001, within_s: 5, hold_s: 3}
+symptoms:
+  laser/process/running: {by_itself: true}
+types:
+  laser:
+    failure_modes:
+      dead: {probability: 0.01, symptoms: [laser/heartbeat/alive, laser/process/running]}
+      dirty: {probability: 0.02, takes_down: false, symptoms: [laser/scan/clear]}
+  motor:
+    failure_modes:
+      stuck: {probability: 0.01, symptoms: [motor/encoder/turns, base/drive/follows]}
+      weak: {probability: 0.02, takes_down: false, symptoms: [base/drive/follows]}
+other: {probability: 1.0e-4}
+""")
+NAMES = [*SMALL.fmea.symptoms, "hall/door/shut"]
+HEARD_S = 30.0
+
+
+def told(happens: Sequence[At]) -> tuple[Evidence, Diagnosis]:
+    """Return the evidence of what monitors found, and what the engine says of it at the end."""
+    tracker = WitnessedTracker(SMALL)
+    tracker.begin(T0_NS)
+    run(tracker, happens, HEARD_S)
+    made = answer(SMALL, tracker.situation(), DiagnosisId("x", 1, 0))
+    return replace(tracker.evidence(), answer=()), made
+
+
+happenings = st.builds(
+    At,
+    st.integers(1, 40).map(lambda half: half / 2),
+    st.sampled_from(NAMES),
+    st.sampled_from(["present", "present", "absent", "unknown"]),
+    st.sampled_from([(), (), ("bus",)]),
+)
+noise = st.builds(
+    At,
+    st.integers(1, 40).map(lambda half: half / 2),
+    st.sampled_from([name for name in NAMES if name != "laser/process/running"]),
+    st.sampled_from(["present", "absent"]),
+    st.just(("bus",)),
+)
+
+
+@given(st.lists(happenings, max_size=8), st.lists(noise, max_size=4), st.integers(0, 4))
+@settings(deadline=None, max_examples=50)
+def test_a_twin_with_the_same_evidence_has_the_same_ranking(
+    happens: list[At], more: list[At], later: int
+) -> None:
+    mine, made = told(happens)
+    shifted = [replace(each, at_s=each.at_s + later / 2) for each in happens]
+    for other in (shifted, [*happens, *more], [*shifted, *more], happens[1:]):
+        evidence, same = told(other)
+        if difference(mine, evidence, HEARD_S) is None:
+            event("the same")
+            assert [(each.id, each.probability) for each in same.hypotheses] == [
+                (each.id, each.probability) for each in made.hypotheses
+            ]
+        else:
+            event("another")
+
+
+def test_what_is_blocked_is_evidence_only_where_the_tracker_uses_it() -> None:
+    seen = At(2, "motor/encoder/turns")
+    mine, _ = told([seen])
+    assert mine.shown["motor/encoder/turns"].level is None
+    for name in ("laser/scan/clear", "laser/heartbeat/alive", "hall/door/shut"):
+        for state in ("present", "absent"):
+            twin, _ = told([seen, At(3, name, state, ("bus",))])
+            assert difference(mine, twin, HEARD_S) is None, (name, state)
+    for twin, _ in (
+        told([seen, At(3, "laser/process/running", "present", ("bus",))]),
+        told([seen, At(3, "laser/process/running", "absent", ("bus",))]),
+        told([seen, At(3, "laser/scan/clear")]),
+        told([seen, At(3, "base/drive/follows", "absent")]),
+    ):
+        assert difference(mine, twin, HEARD_S) is not None
+    again, _ = told([seen, At(3, "motor/encoder/turns", "unknown"), At(4, "motor/encoder/turns")])
+    assert difference(mine, again, HEARD_S) is None, "that it is said again is no news"
 
 
 def test_the_monitors_of_the_simulated_robot() -> None:
@@ -160,14 +255,18 @@ def test_the_monitors_of_the_simulated_robot() -> None:
         return Mission(7, "transport", False, (planted,), 16.0)
 
     of = Outcome("single", 7, [], [])
+    timing = Timing.of(world().knowledge)
     leak = at("navigation_memory_leak")
-    assert prove(of, leak, silent_twins(leak)).verdict == "shows nothing"
+    assert prove(of, leak, silent_twins(leak), timing=timing).verdict == "shows nothing"
     crash = at("localisation_crash")
-    left = prove(of, crash, silent_twins(crash))
+    left = prove(of, crash, silent_twins(crash), timing=timing)
     assert left.verdict == "left" and "localisation" in left.nearest
     copy = replace(catalogue()["localisation_crash"], id="copy")
     twins = [*silent_twins(crash), *alike_twins(crash, [["x#copy"]], {"x#copy": copy})]
-    assert prove(of, crash, twins, observe).verdict == "looks like another"
+    assert prove(of, crash, twins, timing=timing).verdict == "looks like another"
+    (*_, (_, found)) = observe(crash)
+    assert found.answer == ("localisation#crash",)
+    assert timing.timed and timing.together_s == ceiling.Timing.together_s
 
 
 def test_the_table_counts_both_ceilings() -> None:
