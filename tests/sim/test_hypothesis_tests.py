@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,12 @@ import numpy as np
 import pytest
 
 from amberbox import sim
+from amberbox.core.clock import NS
+from amberbox.diagnosis.evidence.conditions import ConditionTracker
 from amberbox.diagnosis.fmea.loader import load_fmea
 from amberbox.experiments.profile import Experiment, read_experiment
-from amberbox.sim.robot import Robot
+from amberbox.sim.robot import START_NS, Robot
+from tests.sim.monitored import batches
 
 FOLDER = Path(sim.__file__).parent / "folder"
 DRIVES = ("current_1_q", "current_2_q")
@@ -115,6 +119,30 @@ def test_a_covered_laser_fails_the_unit_test_and_a_dirty_one_does_not(side: str)
         shares[fault] = measure(scans)
     assert shares.pop(f"laser_{side}_blocked") > 0.1
     assert max(shares.values()) < 0.01
+
+
+@pytest.mark.parametrize("side", ["front", "rear"])
+@pytest.mark.parametrize(
+    ("fault", "magnitude", "state"),
+    [("blocked", 5.0, "present"), ("blocked", 180.0, "present"), ("lens_dirty", 0.95, "absent")],
+)
+def test_the_diagnosis_tells_a_covered_window_from_a_dirty_one(
+    side: str, fault: str, magnitude: float, state: str
+) -> None:
+    fmea, _ = load_fmea(FOLDER / "fmea.yaml")
+    assert fmea is not None
+    robot = Robot(3)
+    robot.inject(f"laser_{side}_{fault}", magnitude=magnitude)
+    covered = {name: of for name, of in fmea.symptoms.items() if name.endswith(".covered")}
+    tracker = ConditionTracker(replace(fmea, symptoms=covered))
+    tracker.begin(START_NS)
+    scans = [each for each in robot.step_until(6.0) if each[0].startswith("scan_")]
+    for batch in batches(scans):
+        tracker.feed(batch)
+    found = tracker.advance(START_NS, START_NS + 6 * NS)
+    states = {each.id: each.state for each in found}
+    assert states[f"laser_{side}.covered"] == state
+    assert states[f"laser_{'rear' if side == 'front' else 'front'}.covered"] == "absent"
 
 
 def test_modes_name_the_outcomes_that_were_measured() -> None:
