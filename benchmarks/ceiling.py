@@ -340,34 +340,42 @@ NAMES = {
 }
 
 
+TARGETS = {("single", "first group"): "95 %", ("single", "first member"): "90 %",
+           ("double", "first group"): "80 %"}  # fmt: skip
+
+
 def ceiling_table(found: Sequence[Outcome], proofs: Sequence[Proof]) -> str:
-    """Return misses, reasons and ceilings by kind, as Markdown."""
-    names = (
-        "misses of the first group", "it shows nothing", "looks like another", "left",
-        "first group, at most", "misses of the first member", "it shows nothing",
-        "looks like another", "left", "first member, at most",
-    )  # fmt: skip
-    lines = [f"| kind | {' | '.join(names)} |", f"|---|{'--:|' * len(names)}"]
+    """Return targets, what was reached and what can be at most, by kind, as Markdown."""
+    lines = [
+        "| what | target | reached | at most | misses | it shows nothing | looks like another "
+        "| left |",
+        f"|---|{'--:|' * 7}",
+    ]
     verdicts = {(proof.kind, proof.seed): proof.verdict for proof in proofs}
     for kind, name in NAMES.items():
         of = [each for each in found if each.kind == kind]
         if not any((kind, each.seed) in verdicts for each in of):
             continue
-        cells: list[str] = []
-        for missed, alike_is_lost in (
-            ([each for each in of if not each.is_right], False),
-            ([each for each in of if not each.leads], True),
+        for place, missed, alike_is_lost in (
+            ("first group", [each for each in of if not each.is_right], False),
+            ("first member", [each for each in of if not each.leads], True),
         ):
             said = [verdicts.get((kind, each.seed), "left") for each in missed]
             silent, alike = said.count("shows nothing"), said.count("looks like another")
-            lost = silent + alike * alike_is_lost
-            cells += map(str, (len(missed), silent, alike, len(missed) - silent - alike))
-            cells.append(f"{len(of) - lost} of {len(of)}")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+            most = len(of) - silent - alike * alike_is_lost
+            cells = (
+                TARGETS.get((kind, place), ""), _share(len(of) - len(missed), len(of)),
+                _share(most, len(of)), len(missed), silent, alike, len(missed) - silent - alike,
+            )  # fmt: skip
+            lines.append(f"| {name}, {place} | {' | '.join(map(str, cells))} |")
     missed = misses(found, NAMES)
     count = sum((each.kind, each.seed) in verdicts for each in missed)
     text = f"{count} of {len(missed)} misses were examined; the others count as left."
     return "\n".join(lines) + f"\n\n{text}\n"
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count} of {of}, {100 * count / of:.0f} %"
 
 
 def case_table(proofs: Iterable[Proof]) -> str:

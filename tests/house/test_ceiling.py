@@ -285,8 +285,11 @@ def test_the_table_counts_both_ceilings() -> None:
         Proof("single", 3, ["c"], "looks like another", "y=1"),
         Proof("single", 5, ["e"], differences={"y=1": "s: present"}),
     ]
-    row, *_, last = ceiling_table(found, proofs).splitlines()[2:]
-    assert row == "| one fault | 3 | 1 | 1 | 1 | 4 of 5 | 4 | 1 | 2 | 1 | 2 of 5 |"
+    row, leading, *_, last = ceiling_table(found, proofs).splitlines()[2:]
+    cells = "95 % | 2 of 5, 40 % | 4 of 5, 80 % | 3 | 1 | 1 | 1"
+    assert row == f"| one fault, first group | {cells} |"
+    cells = "90 % | 1 of 5, 20 % | 2 of 5, 40 % | 4 | 1 | 2 | 1"
+    assert leading == f"| one fault, first member | {cells} |"
     assert last == "4 of 4 misses were examined; the others count as left."
     assert "3 of 4" in ceiling_table(found, proofs[1:])
 
@@ -299,7 +302,7 @@ def test_proofs_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     page.write_text("\n".join(MARKS))
     words = [str(outcomes), "--keep", str(proofs), "--print", "--page", str(page)]
     assert main(words) == 0
-    assert "| one fault | 1 | 1 | 0 | 0 | 0 of 1 |" in page.read_text()
+    assert "| 0 of 1, 0 % | 0 of 1, 0 % | 1 | 1 | 0 | 0 |" in page.read_text()
     assert "| single | 7 | `a` | shows nothing | nothing |" in page.read_text()
     proofs.write_text("{}\n")
     assert main(words) == 2 and "is not of this version" in capsys.readouterr().err
