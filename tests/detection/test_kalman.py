@@ -7,7 +7,15 @@ import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
 from numpy.typing import NDArray
 
-from amberbox.detection.kalman import BankState, LinearModels, correct, mix, predict, switching
+from amberbox.detection.kalman import (
+    BankState,
+    LinearModels,
+    correct,
+    correct_one,
+    mix,
+    predict,
+    switching,
+)
 
 Floats = NDArray[np.float64]
 NO_FLOOR = 0.0
@@ -63,7 +71,10 @@ def test_it_equals_another_library_to_1e_9(robots: int) -> None:
         predict(state, models)
         others = z + random.normal(0, 1, (robots, 2))
         others[robots // 2] = z
-        correct(state, models, others, NO_FLOOR)
+        if robots == 1:
+            correct_one(state, models, z.tolist(), NO_FLOOR)
+        else:
+            correct(state, models, others, NO_FLOOR)
         peer_step(bank, models, z)
         own = robots // 2
         mean, covariance = state.combined()
@@ -148,6 +159,31 @@ def test_a_robot_in_a_batch_is_as_if_it_were_alone() -> None:
             correct(state, models, own, 1e-9)
     assert many.x[7] == pytest.approx(alone.x[0], abs=1e-12)
     assert many.weights[7] == pytest.approx(alone.weights[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("sensors", [1, 2, 3, 4])
+@pytest.mark.parametrize("hidden", [False, True])
+def test_one_robot_in_numbers_is_as_one_in_arrays(sensors: int, hidden: bool) -> None:
+    """Values that are missing, not finite, or far off, and sensors that a model hides."""
+    random = np.random.default_rng(sensors)
+    models = models_at(0.1, sensors)
+    models.masked[2, -1] = hidden
+    arrays = BankState.at(np.zeros(4), np.eye(4), np.full(3, 1 / 3))
+    numbers = BankState.at(np.zeros(4), np.eye(4), np.full(3, 1 / 3))
+    for _ in range(200):
+        z = random.normal(0, 1, sensors)
+        z[random.random(sensors) < 0.2] = random.choice([np.nan, np.inf, 1e6])
+        for state in (arrays, numbers):
+            mix(state, switching(3, 0.9))
+            predict(state, models)
+        many, one = correct(arrays, models, z[None], 1e-9), correct_one(numbers, models, z, 1e-9)
+        best = arrays.weights[0].argmax()
+        assert one.weights == pytest.approx(arrays.weights[0], rel=1e-9, abs=1e-9)
+        assert one.used == many.used[0, best].tolist()
+        assert one.white == pytest.approx(many.white[0, best], rel=1e-9, abs=1e-9)
+        assert one.innovations == pytest.approx(many.innovations[0, best], rel=1e-9, abs=1e-9)
+        assert numbers.x == pytest.approx(arrays.x, rel=1e-9, abs=1e-9)
+        assert numbers.p == pytest.approx(arrays.p, rel=1e-9, abs=1e-9)
 
 
 def test_garbage_does_not_carry_the_state_away() -> None:

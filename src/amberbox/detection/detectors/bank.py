@@ -24,7 +24,7 @@ from amberbox.core.contracts import LearntState, MissionRows, Row, Score, ScoreR
 from amberbox.core.errors import AmberboxError, did_you_mean
 from amberbox.core.options import option
 from amberbox.detection.channels import Floats, add_count, as_floats, as_number, learn_channels
-from amberbox.detection.kalman import BankState, LinearModels, correct, mix, predict, switching
+from amberbox.detection.kalman import BankState, LinearModels, correct_one, mix, predict, switching
 from amberbox.detection.learnt_options import (
     only_value_errors,
     options_from_json,
@@ -178,13 +178,13 @@ class Detector:
         if read == 0:
             return ()
         try:
-            return self._step(row.at_ns, np.array([values], np.float64))
+            return self._step(row.at_ns, values)
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
             add_count(self.counts, "restarts of the filters after a step that failed")
             self._state = None
             return ()
 
-    def _step(self, at_ns: int, z: Floats) -> Sequence[Score]:
+    def _step(self, at_ns: int, z: Sequence[float]) -> Sequence[Score]:
         dt_s = (at_ns - self._last_ns) / NS
         if self._state is not None and dt_s > self.config.gap:
             add_count(self.counts, "restarts of the filters after a gap")
@@ -199,18 +199,16 @@ class Detector:
                     stay = math.exp(-dt_s / self.config.sojourn)
                     mix(state, _switching(len(models.names), stay))
                 predict(state, models.linear)
-            result = correct(state, models.linear, z, self.config.floor)
-            weights: list[float] = state.weights[0].tolist()
-            sizes = sum(weights), np.vdot(state.x, state.x), np.vdot(state.p, state.p)
-        if not all(map(math.isfinite, sizes)):
+            result = correct_one(state, models.linear, z, self.config.floor)
+            size = sum(result.weights) + np.vdot(state.x, state.x) + np.vdot(state.p, state.p)
+        if not math.isfinite(size):
             raise ArithmeticError
         self._state, self._last_names = state, models.names
-        nominal = max(weights[models.nominal], 1e-300)
+        nominal = max(result.weights[models.nominal], 1e-300)
         scores = [Score(at_ns, "model", max(-math.log(nominal), 0.0))]
-        best = weights.index(max(weights))
-        used = np.flatnonzero(result.used[0, best]).tolist()
+        used = [place for place, is_used in enumerate(result.used) if is_used]
         if used:
-            white, apart = result.white[0, best].tolist(), result.innovations[0, best].tolist()
+            white, apart = result.white, result.innovations
             now = math.sqrt(sum(white[place] * white[place] for place in used) / len(used))
             before = now if self._innovation is None else self._innovation
             self._innovation = before + self.config.smoothing * (now - before)
