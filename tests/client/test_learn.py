@@ -12,9 +12,13 @@ from amberbox.cli.main import main
 from amberbox.client.fleet import Fleet
 from amberbox.client.opening import open_remote
 from amberbox.consult.repairs import FoundFaults, read_situations
+from amberbox.core.clock import NS
+from amberbox.core.timestamps import format_time
 from amberbox.detection.model_file import load_model
+from amberbox.testing.records import T0_NS
 from tests.client.served import Served
 from tests.server.knowledge import robot as sim
+from tests.support.processes import wait_for
 
 FMEA = """\
 defaults: {detects: 0.5, within_s: 0.5}
@@ -94,6 +98,8 @@ def test_a_server_learns_and_the_model_comes_to_a_robot(
         (["model", "delete", server, "drive"], "name the version"),
         (["model", str(tmp_path)], "no address of a server"),
         (["model", "detect", server, "drive", "--from", "-1m"], "the range of detect"),
+        (["model", "follow", server, "drive", "--to", "-1m"], "--from that of follow"),
+        (["model", "follow", server, "drive"], "only a model of a team"),
         (["learn", kitchen, "--team"], "two robots at least"),
         (["learn", kitchen, str(tmp_path)], "not both"),
         (["learn", kitchen, "--missions", "nowhere"], "no mission 'nowhere'"),
@@ -102,3 +108,33 @@ def test_a_server_learns_and_the_model_comes_to_a_robot(
     ):
         assert main(wrong) in (1, 2)
         assert what in capsys.readouterr().err, wrong
+
+
+def test_a_model_of_a_team_follows_its_robots(
+    technician: Served, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As far as the first robot's record reaches, which ends before that of the other begins."""
+    server, team = f"{technician.url}#ca=sha256:{technician.pin}", ["ropod_001", "ropod_003"]
+    begin_ns, end_ns = T0_NS, T0_NS + 10 * NS
+    with Fleet(server) as fleet:
+        for robot in team:
+            mission = fleet.begin_mission(robot, "together", at=begin_ns)
+            fleet.end_mission(robot, mission.id, "done", at=end_ns)
+        asked = fleet.learn(
+            team, name="pair", team=True, missions=["together"], detectors=["guard"]
+        )
+        fleet.wait_model(asked.id)
+        assert main(["model", "follow", server, "pair", "--from", format_time(begin_ns)]) == 0
+        assert "pair version 1 follows ropod_001, ropod_003" in capsys.readouterr().out
+        wait_for(
+            lambda: fleet.following_model(asked.id).until > format_time(begin_ns + NS) or None,
+            "it has read what the first robot has handed in",
+        )
+    assert main(["model", "follow", server, "pair", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["from"], found["error"]) == (format_time(begin_ns), "")
+    assert found["until"] < format_time(begin_ns + 3 * NS)
+    assert main(["model", "unfollow", server, "pair"]) == 0
+    assert "follows no longer" in capsys.readouterr().out
+    assert main(["model", "delete", server, "pair:1"]) == 0
+    capsys.readouterr()

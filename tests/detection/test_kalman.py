@@ -176,7 +176,8 @@ def test_one_robot_in_numbers_is_as_one_in_arrays(sensors: int, hidden: bool) ->
         for state in (arrays, numbers):
             mix(state, switching(3, 0.9))
             predict(state, models)
-        many, one = correct(arrays, models, z[None], 1e-9), correct_one(numbers, models, z, 1e-9)
+        many = correct(arrays, models, z[None], 1e-9)
+        one = correct_one(numbers, models, z.tolist(), 1e-9)
         best = arrays.weights[0].argmax()
         assert one.weights == pytest.approx(arrays.weights[0], rel=1e-9, abs=1e-9)
         assert one.used == many.used[0, best].tolist()

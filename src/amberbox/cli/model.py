@@ -1,4 +1,4 @@
-"""Models of detectors on a server: list, save, install on a robot, run over recordings, delete."""
+"""Models of detectors on a server: list, save, install, run over recordings, follow, delete."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ from amberbox.core.units import bytes_text
 
 if TYPE_CHECKING:
     from amberbox.client.fleet import Fleet
-    from amberbox.client.models import DetectorAlarmLine, LearntModel
+    from amberbox.client.models import DetectorAlarmLine, FollowingModel, LearntModel
 
 _USAGE = (
     "amberbox model [list] URL | get URL NAME[:VERSION] -o FILE | "
     "install URL NAME[:VERSION] [--key NAME] [--wait] [--intent] | "
-    "detect URL NAME[:VERSION] --from T --to T | delete URL NAME:VERSION [--json]"
+    "detect URL NAME[:VERSION] --from T --to T | follow URL NAME[:VERSION] [--from T] | "
+    "unfollow URL NAME[:VERSION] | delete URL NAME:VERSION [--json]"
 )
+_RANGES = {"detect": ((True, True),), "follow": ((False, False), (True, False))}
+"""Which of --from and --to an action takes, together; any other one takes none."""
 _HEADER = ("name", "version", "state", "robots", "detectors", "size", "asked (UTC)", "who")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
-    of_one = ("get", "install", "detect", "delete")
+    of_one = ("get", "install", "detect", "follow", "unfollow", "delete")
     words: dict[str, Sequence[str]] = {"list": (), **dict.fromkeys(of_one, ("MODEL",))}
     place = "https://host:port of the server; then NAME:VERSION of a model, or its id"
     add_actions(parser, words, "list", place)
@@ -48,13 +51,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List, save, install, detect or delete."""
+    """List, save, install, detect, follow or delete."""
     if not is_url(args.where):
         raise UsageError(f"{args.where} is no address of a server", _USAGE)
     if len(args.rest) != (args.action != "list") or bool(args.output) != (args.action == "get"):
         raise UsageError(f"this is no {args.action}", _USAGE)
-    if (args.action == "detect") != bool(args.from_ and args.to):
-        raise UsageError("--from and --to are the range of detect", _USAGE)
+    if (bool(args.from_), bool(args.to)) not in _RANGES.get(args.action, ((False, False),)):
+        raise UsageError("--from and --to are the range of detect, --from that of follow", _USAGE)
     for option in ("from_", "to"):
         check_time(f"--{option.strip('_')}", getattr(args, option))
     from amberbox.client.fleet import Fleet
@@ -63,15 +66,24 @@ def run(args: argparse.Namespace) -> int:
         if args.action == "list":
             _list(fleet.learnt_models(), as_json=args.json)
             return 0
-        model = _named(fleet, args.rest[0])
-        if args.action == "get":
+        return _do(args, fleet, _named(fleet, args.rest[0]))
+
+
+def _do(args: argparse.Namespace, fleet: Fleet, model: LearntModel) -> int:
+    """Do what is asked with one model."""
+    match args.action:
+        case "get":
             _get(fleet, model, Path(args.output), as_json=args.json)
-        elif args.action == "install":
+        case "install":
             return _install(args, fleet, model)
-        elif args.action == "detect":
+        case "detect":
             robot = read_address(args.where).robot
             _detect(fleet.detect(model.id, args.from_, args.to, [robot] if robot else []), args)
-        else:
+        case "follow":
+            _follow(fleet.follow_model(model.id, args.from_ or None), model, args)
+        case "unfollow":
+            _unfollow(fleet, model, as_json=args.json)
+        case _:
             _delete(fleet, model, args.rest[0], as_json=args.json)
     return 0
 
@@ -112,10 +124,33 @@ def _install(args: argparse.Namespace, fleet: Fleet, model: LearntModel) -> int:
     return send(args, fleet, robot, MODEL_INSTALL, words)
 
 
+def _follow(found: FollowingModel, model: LearntModel, args: argparse.Namespace) -> None:
+    if args.json:
+        print_json(msgspec.to_builtins(found))
+        return
+    print(f"{model.name} version {model.version} follows {', '.join(model.robots)}, "
+          f"from {found.from_[:19]} to {found.until[:19]} so far")  # fmt: skip
+    if found.error:
+        print(f"it does not go on: {found.error}")
+    _print_alarms(found.alarms)
+
+
+def _unfollow(fleet: Fleet, model: LearntModel, *, as_json: bool) -> None:
+    found = fleet.unfollow_model(model.id)
+    if as_json:
+        print_json(msgspec.to_builtins(found))
+    else:
+        print(f"{model.name} version {model.version} follows no longer")
+
+
 def _detect(alarms: Sequence[DetectorAlarmLine], args: argparse.Namespace) -> None:
     if args.json:
         print_json([msgspec.to_builtins(alarm) for alarm in alarms])
         return
+    _print_alarms(alarms)
+
+
+def _print_alarms(alarms: Sequence[DetectorAlarmLine]) -> None:
     for one in alarms:
         until = f" until {one.gone}" if one.gone else ""
         print(f"{one.confirmed[:23]}{until}  {one.robot or 'team'}  {one.id}: {one.reason}")

@@ -740,6 +740,22 @@ class Fleet(AlarmCalls, CommandCalls, ExperimentCalls):
         answer = self.wire.get(f"/models/{model}/alarms", asked).body
         return msgspec.json.decode(answer, type=list[models.DetectorAlarmLine])
 
+    def follow_model(self, model: str, from_: Time = None) -> models.FollowingModel:
+        """Let a model of a team follow its robots from a time on, now by default, unless it does.
+
+        Returns how far it is, and its alarms.
+        """
+        body = {"from": time_text(from_)}
+        return self._send("POST", f"/models/{model}/follow", models.FollowingModel, body)
+
+    def following_model(self, model: str) -> models.FollowingModel:
+        """Return how far a model that follows its robots is, and its alarms."""
+        return self._get(f"/models/{model}/follow", models.FollowingModel)
+
+    def unfollow_model(self, model: str) -> models.LearntModel:
+        """Let a model follow no longer, and forget its alarms."""
+        return self._send("DELETE", f"/models/{model}/follow", models.LearntModel)
+
     def delete_model(self, model: str) -> models.LearntModel:
         """Stop learning a model, or delete one that is over."""
         return self._send("DELETE", f"/models/{model}", models.LearntModel)

@@ -625,6 +625,22 @@ class DetectorAlarmLine(_Answer):
 
 
 @dataclass(frozen=True, slots=True)
+class FollowingModel(_Answer):
+    """A model of a team that follows its robots, since ``from``: the records are done up to
+    ``until``, as far as all robots have handed theirs in.
+
+    ``alarms`` are the newest ones, oldest first; ``gone`` of one is null while it lasts. ``error``
+    says why the model does not go on.
+    """
+
+    id: str
+    from_: str
+    until: str
+    error: str
+    alarms: Sequence[DetectorAlarmLine]
+
+
+@dataclass(frozen=True, slots=True)
 class DiagnosisLine(_Answer):
     """A diagnosis in a list; ``faults`` and ``probability`` are those of the leading hypothesis.
 

@@ -80,7 +80,11 @@ class RecordDetection:
         self._waiting.sort(key=itemgetter(0))
         due = [row for _, row in self._waiting if row.at_ns <= until_ns]
         del self._waiting[: len(due)]
-        for row in due:
+        yield from self.take_rows(due, until_ns)
+
+    def take_rows(self, rows: Iterable[Row], until_ns: int) -> Iterator[Detected]:
+        """Take rows in the order of arrival: all those after the earlier ones, up to a log time."""
+        for row in rows:
             yield from self._pass_time(row.at_ns)
             self._last_ns = row.at_ns
             changed = [a for one in self._detectors.values() for a in one.update((row,))]

@@ -49,6 +49,7 @@ from amberbox.server.ingest.uploads import IncomingJournal, UploadService
 from amberbox.server.ingest.verification import VerificationResult
 from amberbox.server.journals import JournalKey
 from amberbox.server.knowledge.explanations import Explained, publish_diagnoses
+from amberbox.server.learning.following import FollowService
 from amberbox.server.learning.models import LearningService
 from amberbox.server.live.feed import Feed
 from amberbox.server.live.views import FleetState
@@ -154,6 +155,7 @@ def make_services(
         explained=Explained(database, archive, bus, clock, worker_pool, robot_worker_pool),
         jobs=DownloadService(folder, database, bus, clock),
         learning=LearningService(folder, database, bus, clock),
+        following=FollowService(folder, database, bus, worker_pool),
         fetches=FetchService(folder, database, bus, clock, links),
         alarms=Alarms(database, bus, clock, settings.public_url),
         record_orders=RecordOrders(database, bus, clock),
@@ -174,9 +176,9 @@ def parts(services: Services) -> Sequence[BackgroundService]:
     """Return the background services."""
     return (
         services.folders, services.worker_pool, services.explained, services.jobs,
-        services.learning, services.fetches, services.alarms, services.record_orders,
-        services.feed, services.runner, services.judge, services.robot_runs, services.system,
-        services.keeping, services.revocation, Warming(),
+        services.learning, services.following, services.fetches, services.alarms,
+        services.record_orders, services.feed, services.runner, services.judge,
+        services.robot_runs, services.system, services.keeping, services.revocation, Warming(),
     )  # fmt: skip
 
 

@@ -6,10 +6,11 @@ import hashlib
 import html
 import json
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from amberbox.agent.detect import read_for
@@ -19,8 +20,10 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.timestamps import format_time
 from amberbox.detection.model_file import read_model
+from amberbox.server.bus import ServerChange
 from amberbox.server.learning import models
 from amberbox.server.learning.models import MOST_WAITING, LearnRequest
+from amberbox.server.learning.worker import follow
 from amberbox.server.schema import AUDIT, COMMAND_ROBOT
 from amberbox.testing.records import T0_NS, FakeItem, FakeRun
 from tests.server.archive.recordings import Robot
@@ -266,6 +269,99 @@ def test_robots_of_a_team_are_learnt_side_by_side_and_one_out_of_step_is_found(
     file.write_bytes(fetched(home, told))
     with pytest.raises(AmberboxError, match="model of a team"):
         read_for(file, open_store(tmp_path / "ropod_001"))
+
+
+def _hand_in_turns(home: House, folder: Path, begin_ns: int, until_s: int) -> dict[str, list[Path]]:
+    """Record both robots of the team in pieces of 50 s; return their journals, none handed in."""
+    found = {}
+    for robot in _TEAM:
+        own = Robot(robot, folder, items=[ARM])
+        run, noise = FakeRun(own.store, items=[ARM]), random.Random(robot)
+        for n in range(5 * until_s):
+            if n % 250 == 0:
+                run.start(begin_ns + n * NS // 5 - 1)
+            angle = _angle(n / 5, robot) + noise.gauss(0, 0.01)
+            run.write([(begin_ns + n * NS // 5, ARM, {"angle": angle})])
+            if n % 250 == 249:
+                run.rotate()
+        run.close()
+        found[robot] = own.files()
+    return found
+
+
+def test_a_team_that_is_followed_is_judged_as_its_robots_hand_in_their_records(
+    home: House, tmp_path: Path
+) -> None:
+    """Handed in piece by piece, with the server ending in between, it finds what a replay finds."""
+    begin_ns = T0_NS + 7200 * NS
+    journals = _hand_in_turns(home, tmp_path, begin_ns, 200)
+    owns = {robot: Robot(robot, tmp_path, items=[ARM]) for robot in _TEAM}
+    technician, archive = home.client("technician"), home.services.archive
+
+    def hand_in(robot: str, number: int) -> None:
+        owns[robot].hand_in(archive, journals[robot][number])
+        details = {"store_id": owns[robot].store_id, "journal": "", "state": "verified"}
+        home.services.bus.publish(ServerChange("journal", robot, details))
+
+    for robot in _TEAM:
+        for number in range(3):  # 150 s, nothing is wrong
+            hand_in(robot, number)
+    times = [format_time(begin_ns + s * NS) for s in (0, 150, 200)]
+    for robot in _TEAM:
+        _mission(home, robot, times[0], times[1])
+    told = learnt(
+        home, robots=_TEAM, team=True, missions=["dance"], name="pair",
+        options={"state_flow": {"window": 1.0, "states": 2}}, **{"from": times[0]},
+    )  # fmt: skip
+    assert told["state"] == "done", told
+    url = f"{MODELS}/{told['id']}/follow"
+    assert technician.get(url).status_code == 404
+    started = technician.post(url, json={"from": times[0]})
+    assert started.status_code == 200, started.text
+    assert (started.json()["until"], started.json()["alarms"]) == (times[0], [])
+
+    def until() -> str:
+        return str(technician.get(url).json()["until"])
+
+    def go_on(to: str, begun: Callable[[], None] | None = None) -> None:
+        """Let the service work until it is there; each call is one more start of a server."""
+        work_until(home.services.following.run, lambda: until() >= to, begun)
+
+    go_on(format_time(begin_ns + 149 * NS))
+    assert technician.get(url).json()["alarms"] == []
+    reached = until()
+    hand_in(_TEAM[0], 3)
+    later = f"{MODELS}/{told['id']}/alarms"
+    arguments = {"id": told["id"], "file": told["file"], "robots": _TEAM}
+    step = msgspec.json.decode(follow(home.services.folder, arguments))
+    assert format_time(step["until_ns"]) == reached  # the other one's record is not here yet
+    go_on(format_time(begin_ns + 199 * NS), lambda: hand_in(_TEAM[1], 3))
+    found = technician.get(url).json()
+    replay = technician.get(later, params={"from": times[0], "to": found["until"]}).json()
+    assert (
+        found["error"] == ""
+        and [one["id"] for one in found["alarms"]].count("state_flow.team.team") == 1
+    ), found
+    assert found["alarms"] == [one for one in replay if one["robot"] == ""]
+    page = technician.get("/models").text
+    assert "state_flow.team.team" in page and f"{url}" in page
+    assert home.client("nurse").get(url).status_code == 404
+    assert home.client("viewer").post(url, json={}).status_code == 403
+    again = technician.post(url, json={"from": times[0]}).json()
+    assert again == found  # it follows already
+    assert technician.delete(url).status_code == 200
+    assert technician.get(url).status_code == 404
+
+
+def test_only_a_finished_model_of_a_team_follows(home: House) -> None:
+    technician = home.client("technician")
+    waits = ask(home, detectors=["guard"])
+    url = f"{MODELS}/{waits['id']}/follow"
+    assert technician.post(url, json={}).status_code == 404
+    technician.delete(f"{MODELS}/{waits['id']}")
+    told = learnt(home, detectors=["guard"])
+    refused = technician.post(f"{MODELS}/{told['id']}/follow", json={})
+    assert refused.status_code == 400 and "of a team" in refused.text
 
 
 def _angle(second: float, robot: str) -> float:

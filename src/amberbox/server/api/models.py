@@ -8,7 +8,7 @@ from fastapi import Path, Query
 from fastapi.responses import FileResponse
 from pydantic import Field
 
-from amberbox.core.api import DetectorAlarmLine, LearntModel
+from amberbox.core.api import DetectorAlarmLine, FollowingModel, LearntModel
 from amberbox.server.http.auth import Fleet, Routes, Who
 from amberbox.server.http.forms import ID, Form, From, Id, To, download_headers
 from amberbox.server.services import models
@@ -76,6 +76,30 @@ def detect_with_model(
     Detection begins anew with the range, and is bounded as queries are.
     """
     return models.detect_with_model(fleet, who, id, robot, from_, to)
+
+
+class NewFollowing(Form):
+    """Since when a model of a team is to follow its robots; now if it is empty."""
+
+    from_: Annotated[_Time, Field(alias="from")] = ""
+
+
+@routes.post("/models/{id}/follow", "models.write", each=True)
+def follow_with_model(fleet: Fleet, who: Who, id: ModelId, new: NewFollowing) -> FollowingModel:
+    """Let a model of a team follow what its robots hand in, unless it does already."""
+    return models.follow_with_model(fleet, who, id, new.from_)
+
+
+@routes.get("/models/{id}/follow", "models.read", each=True)
+def following_model(fleet: Fleet, who: Who, id: ModelId) -> FollowingModel:
+    """Tell how far a model that follows its robots is, and which alarms it has found."""
+    return models.following_model(fleet, who, id)
+
+
+@routes.delete("/models/{id}/follow", "models.write", each=True)
+def unfollow_model(fleet: Fleet, who: Who, id: ModelId) -> LearntModel:
+    """Let a model follow no longer, and forget its alarms."""
+    return models.unfollow_model(fleet, who, id)
 
 
 @routes.delete("/models/{id}", "models.write", each=True)

@@ -11,8 +11,8 @@ from typing import Any
 
 import msgspec
 
-from amberbox.core.contracts import MissionRows
-from amberbox.detection.alarms import DetectorAlarm, alarm_to_json
+from amberbox.core.contracts import MissionRows, Span
+from amberbox.detection.alarms import COMBINED, DetectorAlarm, alarm_to_json
 from amberbox.detection.learn import learning, options_of, report_lines
 from amberbox.detection.learnt_detector import LearntDetector
 from amberbox.detection.missions import (
@@ -26,9 +26,15 @@ from amberbox.detection.missions import (
     team_rows,
 )
 from amberbox.detection.model_file import DetectionModel, load_model, save_model
-from amberbox.detection.record_detection import learnt_items
+from amberbox.detection.record_detection import RecordDetection, learnt_items
 from amberbox.server.data.missions import missions
-from amberbox.server.data.snapshot import SnapshotRecord, open_catalogue
+from amberbox.server.data.snapshot import (
+    RecordSnapshot,
+    SnapshotRecord,
+    open_catalogue,
+    with_snapshot,
+)
+from amberbox.server.learning.following import FILE, STEP_NS, FollowState, with_changes
 from amberbox.server.learning.models import FOLDER, LearningProgress, LearnRequest
 from amberbox.server.live.records import clock_offsets_ns
 
@@ -83,13 +89,7 @@ def detect(folder: Path, arguments: Mapping[str, Any]) -> bytes:
     model = load_model(folder / FOLDER / arguments["id"] / arguments["file"])
     span, robots = (arguments["from_ns"], arguments["to_ns"]), arguments["robots"]
     ahead_ns = _ahead_ns(folder, robots) if arguments["team"] else {}
-    members = {}
-    for robot in robots:
-        record = _record(folder, robot, span).record
-        known = readable_items(record)
-        learnt = learnt_items(model, known)
-        items = tuple(name for name in known if {name, f"{robot}/{name}"} & learnt)
-        members[robot] = RecordRows(record, robot, span, items, short_lists(record, items))
+    members = {robot: _rows(folder, model, robot, span) for robot in robots}
     if arguments["team"]:
         found = {"": _alarms(model, team_rows(members, span, ahead_ns))}
     else:
@@ -100,6 +100,57 @@ def detect(folder: Path, arguments: Mapping[str, Any]) -> bytes:
         for alarm in alarms[:_MOST_ALARMS]
     ]
     return msgspec.json.encode(lines)
+
+
+def follow(folder: Path, arguments: Mapping[str, Any]) -> bytes:
+    """Return how far a model of a team has come, as JSON, after at most ten minutes more of record.
+
+    It goes as far as the record of every robot reaches; alarms do not depend on the steps.
+    """
+    place = folder / FOLDER / arguments["id"]
+    state = msgspec.json.decode((place / FILE).read_bytes(), type=FollowState)
+    robots, from_ns = arguments["robots"], state.until_ns
+    ends = [_complete_ns(folder, robot, state) for robot in robots]
+    to_ns = min(from_ns + STEP_NS, *ends)
+    if to_ns <= from_ns:
+        return msgspec.json.encode(msgspec.structs.replace(state, error=""))
+    model = load_model(place / arguments["file"])
+    detection = RecordDetection(model)
+    if state.snapshot is None:
+        detection.begin(from_ns)
+    else:
+        detection.resume(state.snapshot)
+    members = {}
+    for robot in robots:
+        ahead_ns = state.ahead_ns.get(robot, 0)
+        members[robot] = _rows(folder, model, robot, (from_ns - ahead_ns, to_ns - ahead_ns))
+    changes = (
+        {**alarm_to_json(one), "robot": ""}
+        for one in detection.take_rows(
+            team_rows(members, (from_ns, to_ns), state.ahead_ns), to_ns - 1
+        )
+        if isinstance(one, DetectorAlarm) and one.detector != COMBINED
+    )
+    alarms = with_changes(state.alarms, changes)
+    found = FollowState(state.from_ns, to_ns, state.ahead_ns, detection.snapshot(), alarms)
+    return msgspec.json.encode(found)
+
+
+def _complete_ns(folder: Path, robot: str, state: FollowState) -> int:
+    """Return up to when a robot's record is here, by the server's clock; the start without one."""
+    ahead_ns = state.ahead_ns.get(robot, 0)
+    span = state.until_ns - ahead_ns, None
+    found = with_snapshot(folder, robot, RecordSnapshot.complete_ns, span)
+    return state.until_ns if found is None else found + ahead_ns
+
+
+def _rows(folder: Path, model: DetectionModel, robot: str, span: Span) -> RecordRows:
+    """Return the rows of a robot that a model has learnt, its own or those of a team's member."""
+    record = _record(folder, robot, span).record
+    known = readable_items(record)
+    learnt = learnt_items(model, known)
+    items = tuple(name for name in known if {name, f"{robot}/{name}"} & learnt)
+    return RecordRows(record, robot, span, items, short_lists(record, items))
 
 
 def _alarms(model: DetectionModel, rows: MissionRows) -> list[DetectorAlarm]:

@@ -34,6 +34,7 @@ from amberbox.server.ingest.folders import FolderService
 from amberbox.server.ingest.link_server import LinkServer, SessionRevocation
 from amberbox.server.ingest.uploads import UploadService
 from amberbox.server.knowledge.explanations import Explained
+from amberbox.server.learning.following import FollowService
 from amberbox.server.learning.models import LearningService
 from amberbox.server.live.feed import Feed
 from amberbox.server.record_orders import RecordOrders
@@ -110,6 +111,7 @@ class Services:
     explained: Explained
     jobs: DownloadService
     learning: LearningService
+    following: FollowService
     fetches: FetchService
     alarms: Alarms
     record_orders: RecordOrders

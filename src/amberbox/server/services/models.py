@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Connection
 
-from amberbox.core.api import DetectorAlarmLine, LearntModel
+from amberbox.core.api import DetectorAlarmLine, FollowingModel, LearntModel
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time, maybe_time
@@ -18,7 +18,9 @@ from amberbox.detection.learn import DEFAULT_DETECTORS, make_detectors, options_
 from amberbox.server import commands
 from amberbox.server.bus import ServerChange
 from amberbox.server.learning import models
+from amberbox.server.learning.following import FollowState
 from amberbox.server.learning.models import LearnRequest, StoredModel
+from amberbox.server.live.records import clock_offsets_ns
 from amberbox.server.services.context import Caller, NotFoundError, Services, robot_span_ns
 from amberbox.server.workers.jobs import OPEN
 
@@ -157,6 +159,76 @@ def detect_with_model(
     }  # fmt: skip
     answer = fleet.worker_pool.ask_now(f"{_WORKER}:detect", arguments, origin=who.person)
     return [_alarm_line(found) for found in msgspec.json.decode(answer)]
+
+
+def follow_with_model(
+    fleet: Services, who: Caller, model_id: str, from_: str = ""
+) -> FollowingModel:
+    """Let a model of a team follow its robots from a time on, now by default, unless it does.
+
+    Raises NotFoundError for a model that is not finished, UsageError for one of no team.
+    """
+    with fleet.database.reading() as connection:
+        model = _find(connection, who, "models.write", model_id)
+        robots = model.wanted.robots
+        _check_robots(connection, who, "data.query", robots)
+        ahead_ns = clock_offsets_ns(connection, robots)
+    if model.state != "done":
+        raise NotFoundError(f"there is no file: the model is {model.state}")
+    if not model.wanted.team:
+        hint = "install any other one on its robot, which follows its own record"
+        raise UsageError("only a model of a team follows on the server", hint)
+    now_ns = fleet.clock.wall_ns()
+    from_ns, _ = robot_span_ns(fleet, robots[0], from_, "")
+    state, is_new = fleet.following.start(model, now_ns if from_ns is None else from_ns, ahead_ns)
+    if is_new:
+        with fleet.database.begin() as connection:
+            details = {"from": format_time(state.from_ns)}
+            who.note(connection, now_ns, "models.follow", model.id, details=details)
+    _publish(fleet, model)
+    return _following(model.id, state)
+
+
+def following_model(fleet: Services, who: Caller, model_id: str) -> FollowingModel:
+    """Return what a model that follows has found; raises NotFoundError for any other one."""
+    with fleet.database.reading() as connection:
+        model = _find(connection, who, "models.read", model_id)
+        _check_robots(connection, who, "data.query", model.wanted.robots)
+    state = fleet.following.state(model.id)
+    if state is None:
+        raise NotFoundError(f"{model.name} version {model.version} does not follow its robots")
+    return _following(model.id, state)
+
+
+def following_models(
+    fleet: Services, who: Caller, found: Sequence[LearntModel]
+) -> dict[str, FollowingModel]:
+    """Return what each of some models has found of those that follow, by its id."""
+    with fleet.database.reading() as connection:
+        mine = _robots(connection, who, "data.query")
+    states = {
+        one.id: fleet.following.state(one.id)
+        for one in found
+        if one.team and mine.issuperset(one.robots)
+    }
+    return {name: _following(name, state) for name, state in states.items() if state is not None}
+
+
+def unfollow_model(fleet: Services, who: Caller, model_id: str) -> LearntModel:
+    """Let a model follow no longer, and forget its alarms."""
+    with fleet.database.begin() as connection:
+        model = _find(connection, who, "models.write", model_id)
+        who.note(connection, fleet.clock.wall_ns(), "models.unfollow", model.id)
+    fleet.following.stop(model.id)
+    _publish(fleet, model)
+    return model_line(model)
+
+
+def _following(model_id: str, state: FollowState) -> FollowingModel:
+    return FollowingModel(
+        model_id, format_time(state.from_ns), format_time(state.until_ns), state.error,
+        [_alarm_line(alarm) for alarm in state.alarms],
+    )  # fmt: skip
 
 
 def _alarm_line(found: Mapping[str, Any]) -> DetectorAlarmLine:

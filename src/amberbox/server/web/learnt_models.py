@@ -14,7 +14,7 @@ from amberbox.detection.learn import DEFAULT_DETECTORS, make_detectors
 from amberbox.detection.model_file import detector_names
 from amberbox.server.http.auth import Fleet, Who
 from amberbox.server.services.context import Caller, Services
-from amberbox.server.services.models import list_models, model_takers
+from amberbox.server.services.models import following_models, list_models, model_takers
 from amberbox.server.web import text
 from amberbox.server.web.page import PageRoutes, render
 from amberbox.server.web.text import catalogue
@@ -76,8 +76,10 @@ def _robots(fleet: Services, who: Caller) -> list[str]:
 
 def _listed(fleet: Services, who: Caller) -> Mapping[str, Any]:
     found = list_models(fleet, who)
+    following = following_models(fleet, who, found[:_MOST])
     return {
         "lines": found[:_MOST], "more": len(found) > _MOST,
         "may_write": who.may_some("models.write"), "may_fetch": who.may_some("data.download"),
-        "takers": model_takers(fleet, who), "size": text.size, "percent": text.percent,
+        "takers": model_takers(fleet, who), "following": following,
+        "size": text.size, "percent": text.percent,
     }  # fmt: skip
