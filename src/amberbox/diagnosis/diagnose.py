@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal, TypeAlias, cast
 
+from amberbox.core.clock import NS
 from amberbox.core.contracts import (
     AnsweredTest,
     Budget,
@@ -133,9 +134,9 @@ def measured(symptom: Symptom) -> Measured:
     """Return the measurements of a present symptom; without any, the symptom itself."""
     if symptom.state != "present" or symptom.evidence:
         return symptom.evidence
-    from_ns = symptom.onset_ns if symptom.onset_ns is not None else symptom.confirmed_ns
+    from_ns = _onset_ns(symptom)
     to_ns = symptom.confirmed_ns if symptom.confirmed_ns is not None else from_ns
-    return ((symptom.address or symptom.id, from_ns or 0, to_ns or 0),)
+    return ((symptom.address or symptom.id, from_ns, to_ns),)
 
 
 def _proofs(knowledge: Knowledge, situation: ObservedSituation) -> dict[str, frozenset[str]]:
@@ -168,9 +169,7 @@ def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) ->
     ]
     conflicts = dict.fromkeys((*situation.conflicts, *proofs))
     counting = [symptom for symptom in counting if proven_by(knowledge, symptom) is None]
-    if any(symptom.state == "present" and symptom.source in _READ for symptom in counting):
-        # what monitors show may have effects in items that the FMEA does not list
-        counting = [symptom for symptom in counting if not symptom.id.startswith(COMBINED)]
+    counting = _without_effects(knowledge, counting)
     if any(symptom.source not in _READ for symptom in counting):
         counting = [replace(symptom, evidence=measured(symptom)) for symptom in counting]
     found = collect_evidence(counting, conflicts, knowledge.level)
@@ -181,6 +180,30 @@ def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) ->
     for test, answer in situation.answers.items():
         found = with_answer(found, check_named(knowledge, test), answer)
     return found
+
+
+def _without_effects(knowledge: Knowledge, counting: list[Symptom]) -> list[Symptom]:
+    """Leave out what detectors find in items that may be an effect of what monitors show.
+
+    A fault may have effects in items that the FMEA does not list, but not before it began: that is
+    at most ``within_s`` before its symptoms.
+    """
+    known = knowledge.fmea.symptoms
+    began_ns = [
+        _onset_ns(symptom) - round(known[symptom.id].within_s * NS if symptom.id in known else 0)
+        for symptom in counting
+        if symptom.state == "present" and symptom.source in _READ
+    ]
+    return [
+        symptom
+        for symptom in counting
+        if not (began_ns and symptom.id.startswith(COMBINED))
+        or (symptom.state == "present" and _onset_ns(symptom) < min(began_ns))
+    ]
+
+
+def _onset_ns(symptom: Symptom) -> int:
+    return (symptom.confirmed_ns if symptom.onset_ns is None else symptom.onset_ns) or 0
 
 
 def _as_monitored(symptom: Symptom) -> Symptom:

@@ -28,7 +28,7 @@ types:
       dead: {probability: 1.0e-3, symptoms: [motor/heartbeat/alive]}
   fan:
     failure_modes:
-      stuck: {probability: 1.0e-3, symptoms: [fan/range/turns]}
+      stuck: {probability: 1.0e-3, symptoms: [{symptom: fan/range/turns, within_s: 60}]}
 """
 MEASURED = {
     "motor/range/cool": ["motor.temperature"],
@@ -142,6 +142,25 @@ def test_what_a_failure_mode_explains_is_its_evidence_once() -> None:
     # its messages came in time: that the motor is dead is not said by its values
     made = diagnosed(knowledge(), UNUSUAL)
     assert made is not None and not any("motor#dead" in h.faults for h in made.hypotheses[:1])
+
+
+@pytest.mark.parametrize(("within_s", "counts"), [(5, True), (15, False)])
+def test_what_was_unusual_before_a_fault_can_have_begun_is_another_fault(
+    within_s: float, counts: bool
+) -> None:
+    """The motor has been strange since 10 s, and the fan shows at 20 s that it is stuck.
+
+    What the stuck fan may have done to the motor it has done within the time in which it shows.
+    """
+    known = FmeaReferences(MEASURED, MEASURED, detected=MEASURED)
+    fmea, problems = read_fmea(FMEA.replace("within_s: 60", f"within_s: {within_s}"), known)
+    assert fmea is not None, problems
+    strange = finding("combined.timing.motor", leak=1e-6, detects=0.5)
+    made = diagnosed(Knowledge("robot", fmea), strange, present=("fan/range/turns",))
+    assert made is not None
+    expected = {"fan#stuck", UNKNOWN} if counts else {"fan#stuck"}
+    assert made.hypotheses[0].faults == expected
+    assert (strange.id in made.hypotheses[0].explains) is counts
 
 
 def test_a_finding_that_the_file_maps_takes_the_place_of_the_combined_one() -> None:
