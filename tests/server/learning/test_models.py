@@ -343,7 +343,7 @@ def test_a_team_that_is_followed_is_judged_as_its_robots_hand_in_their_records(
         and [one["id"] for one in found["alarms"]].count("state_flow.team.team") == 1
     ), found
     assert found["alarms"] == [one for one in replay if one["robot"] == ""]
-    page = technician.get("/models").text
+    page = technician.get("/detectors").text
     assert "state_flow.team.team" in page and f"{url}" in page
     assert home.client("nurse").get(url).status_code == 404
     assert home.client("viewer").post(url, json={}).status_code == 403
