@@ -18,8 +18,14 @@ from amberbox.diagnosis.faulttree.bounds import (
     least_given,
     rough_bounds,
 )
+from amberbox.diagnosis.faulttree.decision_diagrams import (
+    Diagram,
+    gate_of_diagrams,
+    operations_of_gate,
+)
 from amberbox.diagnosis.faulttree.graph import (
     FaultGraph,
+    FaultGraphVertex,
     FaultTreeModule,
     build_fault_graph,
     split_modules,
@@ -217,3 +223,15 @@ def test_without_probabilities_the_smallest_sets_come_first() -> None:
     assert found is not None and found.probabilities is None and found.share is None
     sizes = [len(entry) for entry in found.sets]
     assert sizes and sizes == sorted(sizes)
+
+
+@pytest.mark.parametrize("size", [2, 3, 5, 8])
+def test_every_gate_takes_as_many_operations_as_foreseen(size: int) -> None:
+    kinds = [("and", 0), ("or", 0), *(("atleast", needed) for needed in range(2, size))]
+    for kind, needed in [*kinds, ("xor", 0), ("not", 0)]:
+        inputs = {"xor": 2, "not": 1}.get(kind, size)
+        diagram = Diagram(Budget())
+        leaves = [diagram.stored(level, 1, 0) for level in range(inputs)]
+        gate_of_diagrams(diagram, kind, leaves, needed)
+        vertex = FaultGraphVertex(kind, tuple(range(inputs)), needed)
+        assert diagram.steps == operations_of_gate(vertex), (kind, needed)

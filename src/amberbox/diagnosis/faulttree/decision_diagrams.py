@@ -453,7 +453,7 @@ def _decisions(
     An order is better if more of the operations were done before its nodes were used up.
     """
     candidates = variable_orders(graph, part)
-    hopeful = _HOPEFUL * sum(_operations(graph.vertices[number]) for number in part.inner)
+    hopeful = _HOPEFUL * sum(operations_of_gate(graph.vertices[number]) for number in part.inner)
     most = budget.most_nodes(MOST_NODES)
     reason = ""
     for allowance, count in (*_TRIALS, (most, _BEST_ORDERS)):
@@ -509,7 +509,7 @@ def _add(bdd: Diagram, graph: FaultGraph, number: int, made: dict[int, int]) -> 
     bdd.forget()
 
 
-def _operations(vertex: FaultGraphVertex) -> int:
+def operations_of_gate(vertex: FaultGraphVertex) -> int:
     """Return how many operations on two diagrams make the one of a gate."""
     size, count = len(vertex.inputs), vertex.count
     if vertex.kind == "atleast":
