@@ -25,7 +25,7 @@ from tests.support.processes import free_port
 KILLS = 50
 WRITE_S = 0.1
 SLACK_S = 0.05
-STALLED_S = 10.0
+STALLED_S = 3.0
 """How long a computer may stand still before a kill; most of the time it does not."""
 _FORK = multiprocessing.get_context("fork")
 
@@ -115,7 +115,7 @@ def test_kill_9_loses_only_the_last_write_interval(folder: Path, sender: tuple[P
     missing = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
     lost_s, explained = _lost_by_kills(sent_ns, numbers, np.array(kills))
     assert not np.setdiff1d(missing, explained).size, "messages are missing that no kill has lost"
-    assert np.median(lost_s) < WRITE_S + SLACK_S
+    assert np.percentile(lost_s, 80) < WRITE_S + SLACK_S
     assert max(lost_s) < STALLED_S
 
 
