@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from amberbox.diagnosis.covering.model import UNKNOWN
 from benchmarks.accuracy import Outcome
 from benchmarks.providers import (
     CHOICES,
     MARKS,
     READ_BY,
     READ_MARKS,
-    UNKNOWN,
     read,
     read_by,
     tables,
