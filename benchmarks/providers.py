@@ -35,7 +35,7 @@ from amberbox.core.types import Batch, Diagnosis, Status, Symptom
 from amberbox.diagnosis.consistency.components import load_components
 from amberbox.diagnosis.consistency.online import mapped
 from amberbox.diagnosis.covering.model import UNKNOWN
-from amberbox.diagnosis.models import models_of
+from amberbox.diagnosis.models import ModelKind, models_of
 from amberbox.diagnosis.tracker import FaultTracker
 from amberbox.monitoring.engine import Engine
 from amberbox.sim.faults import catalogue
@@ -58,7 +58,7 @@ from benchmarks.missions import Batches, Mission, disturbed, live, mode_of, with
 
 FIRST_SEED = 990_000
 SINGLES, DOUBLES, CHAINED, DRAWN, KNOBS, READ, NOMINAL_H = 30, 30, 20, 30, 10, 24, 0.5
-READ_BY = ("equations", "components")
+READ_BY: tuple[ModelKind, ...] = ("equations", "components")
 """Kinds of models; a mission of that kind has a disturbance of a variable that they read."""
 CHOICES: Mapping[str, frozenset[str]] = {
     "FMEA alone": frozenset(),
@@ -177,7 +177,7 @@ def columns() -> Mapping[str, set[str]]:
 
 
 @functools.cache
-def read_by(kind: str) -> Mapping[str, set[str]]:
+def read_by(kind: ModelKind) -> Mapping[str, set[str]]:
     """Return the columns of each item that models of a kind read."""
     found: dict[str, set[str]] = {}
     for path in models_of(folders()["with both"])[kind].values():
@@ -188,7 +188,7 @@ def read_by(kind: str) -> Mapping[str, set[str]]:
     return found
 
 
-def _values_of(kind: str, path: Path) -> Iterator[Expression]:
+def _values_of(kind: ModelKind, path: Path) -> Iterator[Expression]:
     if kind == "equations":
         yield from load_model(path).recorded.values()
     else:
@@ -251,7 +251,7 @@ def _described() -> frozenset[str]:
     return frozenset[str]().union(*(mapped(model, model.faults, modes)[0] for model in loaded))
 
 
-def read(kind: str, seed: int) -> Mission:
+def read(kind: ModelKind, seed: int) -> Mission:
     """Draw a mission with a disturbance of what models of a kind read: evenly over the items."""
     columns_read = read_by(kind)
     item = random.Random(f"{kind} {seed}").choice(sorted(columns_read))
@@ -266,8 +266,9 @@ def read(kind: str, seed: int) -> Mission:
 
 def work(job: Job) -> list[Outcome]:
     """Make and judge a mission with each choice."""
-    if job.kind in READ_BY:
-        mission, truth = read(job.kind, job.seed), [UNKNOWN]
+    kind = next((each for each in READ_BY if each == job.kind), None)
+    if kind is not None:
+        mission, truth = read(kind, job.seed), [UNKNOWN]
     else:
         mission = chained(job.seed) if job.kind == "chained" else mission_of(job)
         truth = truth_of(job.kind, mission)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from amberbox.diagnosis.covering.model import UNKNOWN
+from amberbox.diagnosis.models import ModelKind
 from benchmarks.accuracy import Outcome
 from benchmarks.providers import (
     CHOICES,
@@ -18,7 +19,7 @@ from benchmarks.providers import (
 
 
 @pytest.mark.parametrize("kind", READ_BY)
-def test_a_disturbance_is_of_what_models_of_the_kind_read(kind: str) -> None:
+def test_a_disturbance_is_of_what_models_of_the_kind_read(kind: ModelKind) -> None:
     columns = read_by(kind)
     missions = [read(kind, seed) for seed in range(8)]
     for mission in missions:
