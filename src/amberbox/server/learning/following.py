@@ -29,6 +29,7 @@ STEP_NS = 600 * NS
 
 _OP = "amberbox.server.learning.worker:follow"
 _LOOK_S = 60.0
+_LIMIT_S = 120.0  # of a step, for which nobody waits
 
 
 class FollowState(msgspec.Struct, frozen=True):
@@ -123,7 +124,7 @@ class FollowService:
             return False
         arguments = {"id": model.id, "file": model.file, "robots": model.wanted.robots}
         try:
-            answer = await self._pool.ask(_OP, arguments)
+            answer = await self._pool.ask(_OP, arguments, _LIMIT_S)
             after = msgspec.json.decode(answer, type=FollowState)
         except Exception as error:  # only this model does not go on, until the next journal comes
             text = error.what if isinstance(error, AmberboxError) else type(error).__name__
