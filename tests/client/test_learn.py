@@ -127,13 +127,13 @@ def test_a_model_of_a_team_follows_its_robots(
         assert main(["model", "follow", server, "pair", "--from", format_time(begin_ns)]) == 0
         assert "pair version 1 follows ropod_001, ropod_003" in capsys.readouterr().out
         wait_for(
-            lambda: fleet.following_model(asked.id).until > format_time(begin_ns + NS) or None,
+            lambda: fleet.following_model(asked.id).to > format_time(begin_ns + NS) or None,
             "it has read what the first robot has handed in",
         )
     assert main(["model", "follow", server, "pair", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["from"], found["error"]) == (format_time(begin_ns), "")
-    assert found["until"] < format_time(begin_ns + 3 * NS)
+    assert found["to"] < format_time(begin_ns + 3 * NS)
     assert main(["model", "unfollow", server, "pair"]) == 0
     assert "follows no longer" in capsys.readouterr().out
     assert main(["model", "delete", server, "pair:1"]) == 0

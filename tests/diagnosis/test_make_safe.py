@@ -45,9 +45,12 @@ def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:
     return (*seen, *absent)
 
 
-def told_of(*modes: str) -> tuple[Diagnosis, Explanation]:
-    """Return diagnosis and explanation of what failure modes show."""
-    seen = shown_by(modes)
+def told_of(*modes: str, unseen: str = "") -> tuple[Diagnosis, Explanation]:
+    """Return diagnosis and explanation of what failure modes show.
+
+    Symptoms whose names end with ``unseen`` are not known.
+    """
+    seen = tuple(one for one in shown_by(modes) if not unseen or not one.id.endswith(unseen))
     situation, heading = ObservedSituation(seen, watched=True), DiagnosisId("d", 1, AT_NS)
     found = answer(sim.knowledge(), situation, heading, Effort(hypotheses=10))
     return found, explain(found, sim.knowledge(), seen)

@@ -129,7 +129,7 @@ def _follow(found: FollowingModel, model: LearntModel, args: argparse.Namespace)
         print_json(msgspec.to_builtins(found))
         return
     print(f"{model.name} version {model.version} follows {', '.join(model.robots)}, "
-          f"from {found.from_[:19]} to {found.until[:19]} so far")  # fmt: skip
+          f"from {found.from_[:19]} to {found.to[:19]} so far")  # fmt: skip
     if found.error:
         print(f"it does not go on: {found.error}")
     _print_alarms(found.alarms)

@@ -627,7 +627,7 @@ class DetectorAlarmLine(_Answer):
 @dataclass(frozen=True, slots=True)
 class FollowingModel(_Answer):
     """A model of a team that follows its robots, since ``from``: the records are done up to
-    ``until``, as far as all robots have handed theirs in.
+    ``to``, as far as all robots have handed theirs in.
 
     ``alarms`` are the newest ones, oldest first; ``gone`` of one is null while it lasts. ``error``
     says why the model does not go on.
@@ -635,7 +635,7 @@ class FollowingModel(_Answer):
 
     id: str
     from_: str
-    until: str
+    to: str
     error: str
     alarms: Sequence[DetectorAlarmLine]
 

@@ -31,7 +31,7 @@ def test_texts_that_differ_in_some_words_are_merged(texts: list[str], one: str) 
 
 
 def test_which_laser_is_one_question() -> None:
-    _, told = told_of("localisation#map_old")
+    _, told = told_of("localisation#map_old", unseen=".covered")
     step = told.next
     front, rear = ("front", "laser_front.window"), ("rear", "laser_rear.window")
     assert sorted((one.where, one.test) for one in step.instances) == [front, rear]

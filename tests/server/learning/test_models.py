@@ -318,10 +318,10 @@ def test_a_team_that_is_followed_is_judged_as_its_robots_hand_in_their_records(
     assert technician.get(url).status_code == 404
     started = technician.post(url, json={"from": times[0]})
     assert started.status_code == 200, started.text
-    assert (started.json()["until"], started.json()["alarms"]) == (times[0], [])
+    assert (started.json()["to"], started.json()["alarms"]) == (times[0], [])
 
     def until() -> str:
-        return str(technician.get(url).json()["until"])
+        return str(technician.get(url).json()["to"])
 
     def go_on(to: str, begun: Callable[[], None] | None = None) -> None:
         """Let the service work until it is there; each call is one more start of a server."""
@@ -337,7 +337,7 @@ def test_a_team_that_is_followed_is_judged_as_its_robots_hand_in_their_records(
     assert format_time(step["until_ns"]) == reached  # the other one's record is not here yet
     go_on(format_time(begin_ns + 199 * NS), lambda: hand_in(_TEAM[1], 3))
     found = technician.get(url).json()
-    replay = technician.get(later, params={"from": times[0], "to": found["until"]}).json()
+    replay = technician.get(later, params={"from": times[0], "to": found["to"]}).json()
     assert (
         found["error"] == ""
         and [one["id"] for one in found["alarms"]].count("state_flow.team.team") == 1
