@@ -146,7 +146,7 @@ def _call(run: ExperimentRun, what: str, pick: int, now_ns: int) -> str:
     elif what in ("done", "failed", "aborted", "outcome_unknown"):
         begun = [task.id for task in run.running()] + [order.task for order in run.stop_orders()]
         if begun:
-            run.robot_ended(begun[pick % len(begun)], what, now_ns)  # type: ignore[arg-type]
+            run.robot_ended(begun[pick % len(begun)], what, now_ns)  # type: ignore[arg-type]  # drawn
     elif what == "end again":
         ended = [event for event in run.events if event.kind == "ended"]
         if ended:

@@ -52,7 +52,7 @@ def _become(request: list[Any], main: Callable[[], int | None]) -> None:
         opened = os.open(path, flags, 0o600)
         os.dup2(opened, number)
         os.close(opened)
-    sys.stdin = open(0, closefd=False)  # noqa: SIM115
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115 - stays open
     sys.argv = ["amberbox", *arguments]
     sys.orig_argv = [sys.executable, "-m", "amberbox", *arguments]
     importlib.import_module("sitecustomize").reseed(seed)

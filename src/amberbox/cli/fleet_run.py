@@ -152,7 +152,7 @@ class FollowedRun:
         for one in detail.events[self._seen :]:
             terminal.tell(
                 RunEvent(
-                    one.number, time_ns(one.at), one.kind, one.element, one.task,  # type: ignore[arg-type]
+                    one.number, time_ns(one.at), one.kind, one.element, one.task,  # type: ignore[arg-type]  # as sent
                     one.who, one.text, dict(one.values),
                 )
             )  # fmt: skip

@@ -52,7 +52,7 @@ def test_numbers_of_any_place_width_and_order_are_read() -> None:
         bits = rng.randrange(1, 65)
         kind, order = rng.choice(["uint", "int"]), rng.choice(["little", "big"])
         bit = rng.randrange(0, 16 * 8 - bits + 1)
-        fields.append(FrameField(f"f{n}", bit, bits, kind, order))  # type: ignore[arg-type]
+        fields.append(FrameField(f"f{n}", bit, bits, kind, order))  # type: ignore[arg-type]  # drawn
     frames = [rng.randbytes(16) for _ in range(50)]
     rows = rows_of(FrameLayout(tuple(fields), 16), frames)
     for one in fields:
@@ -168,7 +168,7 @@ def test_frames_go_through_files_and_plots(tmp_path: Path) -> None:
         for n in range(100):
             at = 1_700_000_000 * NS + n * 10**7
             writer.add_message(channel, at, struct.pack("<h6x", -n), at)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()  # type: ignore[no-untyped-call]  # has no types
     out = tmp_path / "out.mcap"
     assert main(["export", str(tmp_path / "in.mcap"), "-o", str(out)]) == 0
     with amberbox.open(out) as record:

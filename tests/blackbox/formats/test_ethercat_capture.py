@@ -62,7 +62,7 @@ def messages(recording: RecordingReader) -> dict[str, list[tuple[int, bytes]]]:
     return found
 
 
-def read(path: Path, options: ReadOptions = ReadOptions()) -> dict[str, list[tuple[int, bytes]]]:  # noqa: B008
+def read(path: Path, options: ReadOptions = ReadOptions()) -> dict[str, list[tuple[int, bytes]]]:  # noqa: B008 - frozen
     with open_recording(path, options) as recording:
         return messages(recording)
 

@@ -123,7 +123,7 @@ def test_processes_are_followed_over_a_restart(tmp_path: Path) -> None:
         for number in (1, 2):
             with subprocess.Popen([program, "600"]) as running:
                 wait_until(lambda: newest("count", 1), "it runs")
-                wait_until(lambda n=number: newest("restarts", n), "it is a new one")  # type: ignore[misc]
+                wait_until(lambda n=number: newest("restarts", n), "it is a new one")  # type: ignore[misc]  # bound now
                 running.kill()
             wait_until(lambda: newest("count", 0), "it has ended")
         found = [json.loads(data) for data in sink.of("process")]

@@ -90,7 +90,7 @@ def test_types_that_are_none_of_ros_are_refused() -> None:
 
 @dataclass
 class Recursive(IdlStruct, typename="p::msg::dds_::Recursive_"):
-    again: "Recursive"  # noqa: UP037
+    again: "Recursive"  # noqa: UP037 - names itself
 
 
 def test_a_type_in_itself_ends() -> None:

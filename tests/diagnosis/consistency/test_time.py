@@ -78,9 +78,9 @@ class Oracle:
     found: dict[Timed, set[State]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.types: dict[str, dict[str, object]] = self.model["types"]  # type: ignore[assignment]
-        self.components: dict[str, str] = self.model["components"]  # type: ignore[assignment]
-        self.steps: list[dict[str, dict[str, str]]] = self.model["steps"]  # type: ignore[assignment]
+        self.types: dict[str, dict[str, object]] = self.model["types"]  # type: ignore[assignment]  # YAML
+        self.components: dict[str, str] = self.model["components"]  # type: ignore[assignment]  # YAML
+        self.steps: list[dict[str, dict[str, str]]] = self.model["steps"]  # type: ignore[assignment]  # YAML
 
         constraints = str([mode.get("constraints") for mode in self.modes(0).values()])
         seen = any("c0.in" in step["observe"] for step in self.steps)
@@ -91,7 +91,7 @@ class Oracle:
         return self.types[[*self.components.values()][number]]
 
     def modes(self, number: int) -> dict[str, dict[str, object]]:
-        found: dict[str, dict[str, object]] = self.kind(number)["modes"]  # type: ignore[assignment]
+        found: dict[str, dict[str, object]] = self.kind(number)["modes"]  # type: ignore[assignment]  # YAML
         return found
 
     def values(
@@ -117,13 +117,13 @@ class Oracle:
                 yield of
 
     def constraints(self, number: int, mode: str) -> Sequence[str]:
-        found: Sequence[str] = self.modes(number)[mode].get("constraints", ())  # type: ignore[assignment]
+        found: Sequence[str] = self.modes(number)[mode].get("constraints", ())  # type: ignore[assignment]  # YAML
         return found
 
     def next_modes(self, number: int, mode: str, values: Mapping[str, str]) -> set[str]:
         """Return the modes that may follow without a fault."""
         found = set()
-        for one in self.kind(number)["transitions"]:  # type: ignore[attr-defined]
+        for one in self.kind(number)["transitions"]:  # type: ignore[attr-defined]  # YAML
             sources = [one["from"]] if isinstance(one["from"], str) else one["from"]
             if ("*" in sources or mode in sources) and holds(one.get("when"), values):
                 found.add(one["to"])
@@ -148,7 +148,7 @@ class Oracle:
 
     def run(self) -> None:
         """Find all timed sets of faults that agree with the steps, with the states they end in."""
-        initial: dict[str, str] = self.model["initial"]  # type: ignore[assignment]
+        initial: dict[str, str] = self.model["initial"]  # type: ignore[assignment]  # YAML
         begin = [
             [initial[name]] if name in initial else ["idle", "busy"] for name in self.components
         ]
@@ -170,7 +170,7 @@ class Oracle:
         total = 0
         for fault, _ in timed:
             name, _, mode = fault.partition("=")
-            total += ranks[self.modes(int(name[1:]))[mode]["probability"]]  # type: ignore[index]
+            total += ranks[self.modes(int(name[1:]))[mode]["probability"]]  # type: ignore[index]  # YAML
         return total
 
     def by_names(self) -> dict[frozenset[str], tuple[int, list[Timed]]]:

@@ -28,7 +28,7 @@ residuals:
 def found(tmp_path: Path, model: str = MODEL, state: str = "present") -> list[Conflict]:
     (tmp_path / "models").mkdir(exist_ok=True)
     (tmp_path / "models" / "base.yaml").write_text(model)
-    symptom = Symptom("fits", state, "fits", 1, 1)  # type: ignore[arg-type]
+    symptom = Symptom("fits", state, "fits", 1, 1)  # type: ignore[arg-type]  # given
     items = residuals.provide(knowledge(), Window(tmp_path, 2, (symptom,)))
     return [item for item in items if isinstance(item, Conflict)]
 

@@ -189,7 +189,7 @@ def test_more_time_never_makes_the_bounds_worse() -> None:
     widths = []
     for rounds in (40, 400, 4_000):
         asked = count()
-        budget = Budget(is_over=lambda asked=asked, most=rounds: next(asked) > most)  # type: ignore[misc]
+        budget = Budget(is_over=lambda asked=asked, most=rounds: next(asked) > most)  # type: ignore[misc]  # bound
         search = BoundedSearch(graph, parts, {}, chances(tree), budget)
         search.run(with_bounds=True)
         widths.append(1.0 if search.bounds is None else search.bounds.width)

@@ -292,7 +292,7 @@ class EtherCatBus:
         counts: Mapping[str, int] = self._row
         self._row = {}
         self._row_ns = time_ns
-        self.put(self._bus, row._replace(**counts).pack(), time_ns)  # type: ignore[arg-type]
+        self.put(self._bus, row._replace(**counts).pack(), time_ns)  # type: ignore[arg-type]  # all are numbers
 
     def _cycle(self, datagrams: Sequence[Datagram]) -> _Cycle | None:
         """Return the cycle of a frame; None if it has no process data."""

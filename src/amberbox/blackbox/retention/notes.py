@@ -146,7 +146,7 @@ def _write(store: Store, note: RecordedNote) -> RecordedNote:
         raise UsageError(f"this is no note: {error}", "write 1 to 4000 characters") from error
     path = submit_note(store, note)
     until_s = time.monotonic() + PATIENCE_S
-    step: Callable[[DerivedJournal], None] = lambda journal: NoteService(store, journal).step()  # noqa: E731
+    step: Callable[[DerivedJournal], None] = lambda journal: NoteService(store, journal).step()  # noqa: E731 - typed
     while path.exists():
         if with_maintenance_lock(store, step):
             continue

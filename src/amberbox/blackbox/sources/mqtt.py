@@ -342,7 +342,7 @@ class _Subscriber:
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
-        limits: Any = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        limits: Any = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # has no types
         limits.MaximumPacketSize = min(self.sink.longest_message(), (1 << 32) - 1)
         return limits
 

@@ -164,9 +164,9 @@ def _open(config: SerialOptions) -> Any:
     """Open the port. DTR and RTS stay as the kernel sets them, also when it is closed."""
     import termios
 
-    import serial  # type: ignore[import-untyped]
+    import serial  # type: ignore[import-untyped]  # has no types
 
-    class QuietSerial(serial.Serial):  # type: ignore[misc]
+    class QuietSerial(serial.Serial):  # type: ignore[misc]  # of Any
         """A port whose control lines are never set by us."""
 
         def _update_dtr_state(self) -> None:
