@@ -108,7 +108,7 @@ _MORE = (
     ("mission", "mission",
      "List the missions of a record, begin and end one by hand, find them in old recordings."),
     ("model", "model",
-     "List models of detectors on a server, save one for a robot, run one there, delete one."),
+     "List models of detectors on a server, save or install one, run one there, delete one."),
     ("play", "play",
      "Play a record into ROS 1, over ZeroMQ, or to Foxglove, at any speed."),
     ("plugins", "plugins",

@@ -290,35 +290,33 @@ arguments:
 
 
 def _goals(goals: Mapping[str, tuple[int, ...]], block: str) -> str:
-    tables = [child_name(item_name(block, topic), "status_list") for topic in goals]
     failed = sorted({status for statuses in goals.values() for status in statuses})
-    return f"""\
-name: goals
-monitor: goals
-description: {yaml_text(f"goals do not fail: {', '.join(map(one_line, goals))}")}
-mappings:
-  - mapping:
-      inputs: [{", ".join(tables)}]
-      outputs:
-        - output: {{name: none_failed, type: bool, severity: warning}}
-arguments:
-  failed: {failed}
-"""
+    tables = [child_name(item_name(block, topic), "status_list") for topic in goals]
+    return _outcomes("goals", f"goals do not fail: {_listed(goals)}", tables, f"failed: {failed}")
 
 
 def _calls(calls: Sequence[str], block: str) -> str:
     tables = [child_name(item_name(block, topic), "response") for topic in calls]
+    says = f"calls of its services do not fail: {_listed(calls)}"
+    return _outcomes("calls", says, tables, "of: calls")
+
+
+def _listed(topics: Iterable[str]) -> str:
+    return ", ".join(map(one_line, topics))
+
+
+def _outcomes(name: str, says: str, tables: Sequence[str], argument: str) -> str:
     return f"""\
-name: calls
+name: {name}
 monitor: goals
-description: {yaml_text(f"calls of its services do not fail: {', '.join(map(one_line, calls))}")}
+description: {yaml_text(says)}
 mappings:
   - mapping:
       inputs: [{", ".join(tables)}]
       outputs:
         - output: {{name: none_failed, type: bool, severity: warning}}
 arguments:
-  of: calls
+  {argument}
 """
 
 
